@@ -117,9 +117,9 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     batch = Batch.check(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     if snooping is not None:
-        down = camera_model.axes == "down"
-        far = far_outside(batch.xy, batch.visible, batch.image_size, down)
-        batch = dataclasses.replace(batch, visible=batch.visible & ~far)
+        y_down = camera_model.axes == "down"
+        is_far = far_outside(batch.xy, batch.visible, batch.image_size, y_down)
+        batch = dataclasses.replace(batch, visible=batch.visible & ~is_far)
     on_cpu = not on_accelerator()
     key = ProgramKey(camera_model, batch.free, batch.known, on_cpu)
 
@@ -149,7 +149,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
     rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
     if snooping is not None:
-        rows["removed"] |= far
+        rows["removed"] |= is_far
     if correlated is not None:
         rows |= _under_errors(batch, rows, solved, correlated == "batch")
     return _result(camera_model, batch, rows)
@@ -204,10 +204,10 @@ def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     return BatchCalibration(model=key_of(model), parameters=free, **rows)
 
 
-def _under_errors(batch: Batch, rows: Rows, solved: SolvedPortions, together: bool) -> Rows:
-    """σ under errors that image points share; `together`: of the same size in all cameras."""
+def _under_errors(batch: Batch, rows: Rows, solved: SolvedPortions, common_sizes: bool) -> Rows:
+    """σ under errors that image points share; `common_sizes`: of the same size in all cameras."""
     ended = np.where(batch.finite, rows["status"], NOT_FINITE)
-    forms, traced = solved.forms(), solved.traced(together)
+    forms, traced = solved.forms(), solved.traced(common_sizes)
     forms.q[ended != CONVERGED] = np.nan
     # Without residuals everything is zero, as it is classically.
     variance = rows["sigma0"] ** 2
@@ -220,14 +220,14 @@ def _under_errors(batch: Batch, rows: Rows, solved: SolvedPortions, together: bo
     views = rows["views"].sum(1)
     points = (rows["redundancy"] + len(batch.free) + POSE * views) // 2
     programs = BatchPrograms(solved.scatter, solved.parts)
-    found = batch_errors(sums, views, points, together, programs)
-    diagonal = np.diagonal(found.covariance, axis1=1, axis2=2)
+    errors = batch_errors(sums, views, points, common_sizes, programs)
+    diagonal = np.diagonal(errors.covariance, axis1=1, axis2=2)
     return {
-        "covariance_correlated": found.covariance,
+        "covariance_correlated": errors.covariance,
         "sigma_correlated": np.sqrt(diagonal),
-        "sigma_position_correlated": np.sqrt(found.pose[..., :3]),
-        "sigma_angles_correlated": np.sqrt(found.pose[..., 3:]),
-        "component_sizes": found.sizes,
+        "sigma_position_correlated": np.sqrt(errors.pose[..., :3]),
+        "sigma_angles_correlated": np.sqrt(errors.pose[..., 3:]),
+        "component_sizes": errors.sizes,
     }
 
 
@@ -238,8 +238,8 @@ def _undetermined(
     sigma = rows["sigma"]
     null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
     # At the limit the last σ say why, if the equations can be solved.
-    told = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
-    return np.where(told[:, None], is_vague(model, batch.free, rows["interior"], sigma), null)
+    is_known = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
+    return np.where(is_known[:, None], is_vague(model, batch.free, rows["interior"], sigma), null)
 
 
 def _snoop(
@@ -256,16 +256,18 @@ def _snoop(
     cause. If it has no solution without them either, it is unchanged.
     """
     weight = np.asarray(portion.seen.weight)
-    cameras = [Snooping(seen > 0, test, significance) for seen in weight]
+    cameras = [Snooping(observed > 0, test, significance) for observed in weight]
     open_ones = np.arange(len(portion.cameras))
-    first = {name: values.copy() for name, values in rows.items()}
-    failed = np.zeros(len(weight), int)
+    first_rows = {name: values.copy() for name, values in rows.items()}
+    failures = np.zeros(len(weight), int)
     for _ in range(MAX_ROUNDS):
-        used = np.stack([camera.used for camera in cameras]).astype(float)
-        at = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
-        tests = np.asarray(tests_of_points(key, in_double(portion.seen), used, at, rows["views"]))
+        is_used = np.stack([camera.used for camera in cameras]).astype(float)
+        unknowns = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
+        tests = np.asarray(
+            tests_of_points(key, in_double(portion.seen), is_used, unknowns, rows["views"])
+        )
         tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
-        failed += rows["status"] != CONVERGED
+        failures += rows["status"] != CONVERGED
         # A camera without a solution goes on for 60 rounds, in each of which it loses at most a
         # point of every view; larger or smaller: the time until it is given up.
         open_ones = np.array(
@@ -273,7 +275,7 @@ def _snoop(
                 i
                 for i in open_ones
                 if tested[i]
-                and failed[i] <= 60
+                and failures[i] <= 60
                 and cameras[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
             ],
             int,
@@ -281,17 +283,17 @@ def _snoop(
         if not len(open_ones):
             break
         # The others get no points: they end at once as "too few points", and keep their rows.
-        left = np.zeros_like(weight)
-        left[open_ones] = [cameras[i].used for i in open_ones]
-        seen = dataclasses.replace(portion.seen, weight=left)
-        again = solve(dataclasses.replace(portion, seen=seen))
+        weight_left = np.zeros_like(weight)
+        weight_left[open_ones] = [cameras[i].used for i in open_ones]
+        observed = dataclasses.replace(portion.seen, weight=weight_left)
+        solved_again = solve(dataclasses.replace(portion, seen=observed))
         for name, values in rows.items():
-            values[open_ones] = again[name][open_ones]
+            values[open_ones] = solved_again[name][open_ones]
     # Neither with nor without: nothing says that the removed points are blunders.
-    lost = (first["status"] != CONVERGED) & (rows["status"] != CONVERGED)
+    is_lost = (first_rows["status"] != CONVERGED) & (rows["status"] != CONVERGED)
     for name, values in rows.items():
-        values[lost] = first[name][lost]
-    for i in np.flatnonzero(lost):
+        values[is_lost] = first_rows[name][is_lost]
+    for i in np.flatnonzero(is_lost):
         cameras[i].used = cameras[i].seen
     rows["removed"] = np.stack([camera.seen & ~camera.used for camera in cameras])
     return rows

@@ -65,8 +65,8 @@ class RigBatch(TableMethods):
         names, counts = np.unique(self.status, return_counts=True)
         states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
         rms = [row["rms"] for row in self.rows if row["status"] in SOLVED and "rms" in row]
-        said = f"median RMS {np.median(rms):.4g} px" if rms else "no result"
-        return f"{len(self)} rigs: {states}; {said}"
+        rms_in_words = f"median RMS {np.median(rms):.4g} px" if rms else "no result"
+        return f"{len(self)} rigs: {states}; {rms_in_words}"
 
     def population(self, ids: Sequence | None = None) -> Population:
         """How parameters and mountings are distributed; `ids` of the rigs, 0, 1, 2, … if not given.
@@ -128,7 +128,7 @@ def calibrate_rigs(  # noqa: PLR0913 keyword arguments of a public function
     settings = rig_settings(
         model,
         free,
-        {name: given for name, given in sections.items() if given is not None},
+        {name: section for name, section in sections.items() if section is not None},
         pixel_size,
         sigma_image,
         max_iterations,
@@ -145,7 +145,7 @@ def calibrate_rigs(  # noqa: PLR0913 keyword arguments of a public function
             progress("calibrating", round(part * len(rigs)), len(rigs))
 
     solved = solve_rigs(rigs, settings, tell)
-    return RigBatch(tuple(row for row, _ in solved), tuple(found for _, found in solved))
+    return RigBatch(tuple(row for row, _ in solved), tuple(adjustment for _, adjustment in solved))
 
 
 def rig_settings(
@@ -161,14 +161,14 @@ def rig_settings(
     """Checked settings.
 
     **Raises:** `InputError`."""
-    found = any_model(model)
+    rig_model = any_model(model)
     one_of("snooping", snooping, TESTS, none=True)
     check_test(snooping, significance)
-    for name, given in sections.items():
+    for name, section in sections.items():
         if name not in SECTIONS:
             raise InputError(f"unknown section {name!r}{did_you_mean(name, SECTIONS)}")
-        if not isinstance(given, Mapping):
-            raise InputError(f"{name} is {show(given)}; expected a table of settings")
+        if not isinstance(section, Mapping):
+            raise InputError(f"{name} is {show(section)}; expected a table of settings")
     if moves := sections.get("rolling_shutter"):
         positive("rolling_shutter: line_time", moves.get("line_time"))
         make_further({"velocities": {"image": ["1"]}, "rolling_shutter": with_free(moves)}, 1.0)
@@ -181,11 +181,13 @@ def rig_settings(
         if not (pair > 0).all():
             raise InputError(f"pixel size {pixel_size}: expected a positive length in mm")
         size = float(pair[0]), float(pair[1])
-    if found.unit == "mm" and size is None:
-        raise InputError(f"model {found.name!r} is in mm: give the size of a pixel (--pixel-size)")
+    if rig_model.unit == "mm" and size is None:
+        raise InputError(
+            f"model {rig_model.name!r} is in mm: give the size of a pixel (--pixel-size)"
+        )
     return RigSettings(
-        found,
-        free_parameters(found, free),
+        rig_model,
+        free_parameters(rig_model, free),
         size,
         dict(sections),
         None if sigma_image is None else positive("sigma_image", sigma_image),
@@ -251,8 +253,8 @@ def check_rigs(
             f"but is {show(size.tolist())}"
         )
     sizes = tuple((int(w), int(h)) for w, h in np.broadcast_to(size, (number, 2)))
-    given = [f"cam{c + 1}" if number > 1 else "cam" for c in range(number)]
-    names = tuple(map(str, given if cameras is None else cameras))
+    default_names = [f"cam{c + 1}" if number > 1 else "cam" for c in range(number)]
+    names = tuple(map(str, default_names if cameras is None else cameras))
     if len({*names}) != number:
         raise InputError(f"cameras must be {number} different names, but are {show(cameras)}")
     return names, sizes

@@ -83,27 +83,27 @@ def solve_camera(
     free: tuple[int, ...],
     max_steps: int,
     size: float,
-    seen: Sightings,
+    sightings: Sightings,
     start: CameraUnknowns,
 ) -> CameraSolution:
     """Calibrate one camera from its start values.
 
     **Arguments:** `free`: columns of the free parameters; `size`: a length of the image, pixels.
     """
-    views = seen.views
-    rows = 2 * jnp.sum(seen.weight > 0)
+    views = sightings.views
+    rows = 2 * jnp.sum(sightings.weight > 0)
     redundancy = rows - len(free) - POSE * jnp.sum(views)
     zero = jnp.asarray(0.0)
     # Ends where no unknown would move by more than 1e-5 of its σ: the printed digits do not depend
     # on the start, and as convergence is quadratic, this costs a step at most.
     tolerance = Tolerance(redundancy, rows * size**2, zero + 1e-5, zero)
 
-    def linearise(at: CameraUnknowns) -> tuple[Float[Array, "views n n"], Float[Array, ""]]:
-        N = normal_equations(model, free, seen, at)
+    def linearise(unknowns: CameraUnknowns) -> tuple[Float[Array, "views n n"], Float[Array, ""]]:
+        N = normal_equations(model, free, sightings, unknowns)
         return N, jnp.where(jnp.all(jnp.isfinite(N)), 0.5 * jnp.sum(N[:, -1, -1]), jnp.nan)
 
     # Stopped before the first step: without redundancy the residuals vanish whatever the camera.
-    few = (redundancy < 1) | ~jnp.any(views)
+    is_few = (redundancy < 1) | ~jnp.any(views)
     loop = iterate(
         linearise,
         lambda N, damping: _change(N, views, damping),
@@ -111,25 +111,29 @@ def solve_camera(
         start,
         lambda _: tolerance,
         max_steps,
-        ~few,
+        ~is_few,
     )
     # Undamped: damping would make singular equations look determined.
     factor = factorise(loop.equations, views, 0.0)
     Q_interior, Q_pose, weakest = cofactors(factor)
     meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])
-    status = jnp.where(few, TOO_FEW, meaning[loop.termination])
-    lost = (status == CONVERGED) & ~(weakest > INDETERMINATE)
+    status = jnp.where(is_few, TOO_FEW, meaning[loop.termination])
+    is_lost = (status == CONVERGED) & ~(weakest > INDETERMINATE)
     # A settled step is taken without being tried, as by the engine; another may yet be rejected.
     settled = loop.termination == stopping.SETTLED
     return CameraSolution(
-        jax.tree.map(lambda one, other: jnp.where(settled, one, other), loop.trial, loop.at),
+        jax.tree.map(
+            lambda trial_leaf, accepted_leaf: jnp.where(settled, trial_leaf, accepted_leaf),
+            loop.trial,
+            loop.at,
+        ),
         loop.cost,
         Q_interior,
         Q_pose,
         factor.reduced,
         redundancy,
         views,
-        jnp.where(lost, SINGULAR, status),
+        jnp.where(is_lost, SINGULAR, status),
         loop.steps,
     )
 

@@ -50,19 +50,19 @@ class ProgramKey(NamedTuple):
 @partial(compile_once, static=0)
 def tests_of_points(
     key: ProgramKey,
-    seen: Sightings,
-    used: Float[AnyArray, "cameras views points"],
-    at: CameraUnknowns,
+    sightings: Sightings,
+    is_used: Float[AnyArray, "cameras views points"],
+    unknowns: CameraUnknowns,
     views: Bool[AnyArray, "cameras views"],
 ) -> Float[Array, "cameras views points"]:
     def test(
         arguments: tuple[Sightings, Array, CameraUnknowns, Array],
     ) -> Float[AnyArray, "views points"]:
-        seen, used, at, views = arguments
-        seen = Sightings(seen.point, seen.xy, seen.weight * views[:, None])
-        return point_tests(key.model, key.free, seen, seen.weight * used, at)
+        sightings, is_used, unknowns, views = arguments
+        sightings = Sightings(sightings.point, sightings.xy, sightings.weight * views[:, None])
+        return point_tests(key.model, key.free, sightings, sightings.weight * is_used, unknowns)
 
-    return key.for_every(test)((seen, used, at, views))
+    return key.for_every(test)((sightings, is_used, unknowns, views))
 
 
 def solve_portion(key: ProgramKey, max_steps: int, size: float, portion: Portion) -> Rows:
@@ -72,9 +72,9 @@ def solve_portion(key: ProgramKey, max_steps: int, size: float, portion: Portion
     return jax.tree.map(np.array, result)
 
 
-def in_double(seen: Sightings) -> Sightings:
+def in_double(sightings: Sightings) -> Sightings:
     """On the device, in double precision: one program for measurements in either."""
-    return jax.tree.map(lambda x: jnp.asarray(x).astype(float), seen)
+    return jax.tree.map(lambda x: jnp.asarray(x).astype(float), sightings)
 
 
 @partial(compile_once, static=(0, 1))
@@ -83,7 +83,7 @@ def _portion_program(
     flat: bool,
     max_steps: int,
     size: float,
-    seen: Sightings,
+    sightings: Sightings,
     interior: Float[AnyArray, "cameras parameters"],
     axes: Float[AnyArray, "cameras 3 3"],
     middle: Float[AnyArray, "cameras 3"],
@@ -91,12 +91,12 @@ def _portion_program(
     model, free = key.model, key.free
 
     def calibrate(arguments: tuple[Sightings, Array]) -> tuple[CameraSolution, Float[Array, ""]]:
-        seen, interior = arguments
-        usable, start = start_values(model, flat, key.known, seen, interior, size)
+        sightings, interior = arguments
+        usable, start = start_values(model, flat, key.known, sightings, interior, size)
         solved = solve_camera(model, free, max_steps, size, usable, start)
         return solved, jnp.sum(residual_lengths(model, usable, solved.at))
 
-    solved, lengths = key.for_every(calibrate)((seen, interior))
+    solved, lengths = key.for_every(calibrate)((sightings, interior))
     # A posteriori, since nobody stated a σ: Σ = σ0²·Q. The number of points follows from the
     # redundancy, 2·points − k − 6·views.
     variance = 2 * solved.cost / solved.redundancy

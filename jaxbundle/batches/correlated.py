@@ -90,104 +90,109 @@ class ComponentParts(NamedTuple):
 
 @partial(compile_once, static=(0, 1))
 def forms_of_portion(
-    key: ProgramKey, settings: CorrelationSettings, seen: Sightings, at: CameraUnknowns
+    key: ProgramKey, settings: CorrelationSettings, sightings: Sightings, unknowns: CameraUnknowns
 ) -> ComponentForms:
-    """The forms of every camera of a portion; `seen`: with the weights of the adjustment."""
-    return key.for_every(lambda given: _forms(key.model, settings, *given))((seen, at))
+    """The forms of every camera of a portion; `sightings`: with the weights of the adjustment."""
+    return key.for_every(lambda camera: _forms(key.model, settings, *camera))((sightings, unknowns))
 
 
 @partial(compile_once, static=(0, 1))
 def traces_of_portion(
     key: ProgramKey,
     settings: CorrelationSettings,
-    seen: Sightings,
-    at: CameraUnknowns,
-    wanted: Bool[AnyArray, " cameras"],
+    sightings: Sightings,
+    unknowns: CameraUnknowns,
+    is_wanted: Bool[AnyArray, " cameras"],
 ) -> ComponentTraces:
     """The traces of the cameras of a portion for which they are wanted."""
     number = len(COMPONENTS)
     zero: list[Any] = [jnp.zeros((number,) * n) for n in (2, 3)]
-    none = lambda _: ComponentTraces(*zero)
-    signs = random_signs(settings, *seen.weight.shape[1:])
+    no_traces = lambda _: ComponentTraces(*zero)
+    signs = random_signs(settings, *sightings.weight.shape[1:])
 
-    def traced(given: tuple[Sightings, CameraUnknowns]) -> ComponentTraces:
-        return traces_of_components(*spans_and_roots(key.model, key.free, settings, *given), signs)
+    def traced(camera: tuple[Sightings, CameraUnknowns]) -> ComponentTraces:
+        return traces_of_components(*spans_and_roots(key.model, key.free, settings, *camera), signs)
 
-    of_camera = lambda given: jax.lax.cond(given[2], traced, none, given[:2])
-    return key.for_every(of_camera)((seen, at, wanted))
+    of_camera = lambda camera: jax.lax.cond(camera[2], traced, no_traces, camera[:2])
+    return key.for_every(of_camera)((sightings, unknowns, is_wanted))
 
 
 @partial(compile_once, static=(0, 1))
 def parts_of_portion(
     key: ProgramKey,
     settings: CorrelationSettings,
-    seen: Sightings,
-    at: CameraUnknowns,
+    sightings: Sightings,
+    unknowns: CameraUnknowns,
     axes: Float[AnyArray, "cameras 3 3"],
     middle: Float[AnyArray, "cameras 3"],
-    wanted: Bool[AnyArray, "cameras k"],
+    is_wanted: Bool[AnyArray, "cameras k"],
 ) -> ComponentParts:
     """What the wanted components give every camera of a portion; that of the independent part is
     the classical covariance, and left at zero."""
-    number, k, views = len(COMPONENTS), len(key.free), seen.weight.shape[1]
+    number, k, views = len(COMPONENTS), len(key.free), sightings.weight.shape[1]
     shapes = (number,), (number, k, k), (number, views, POSE)
     zero: list[Any] = [jnp.zeros(shape) for shape in shapes]
-    none = lambda *_: ComponentParts(*zero)
-    found = partial(_parts, key.model, key.free, settings)
-    of_camera = lambda given: jax.lax.cond(jnp.any(given[-1][1:]), found, none, *given)
-    return key.for_every(of_camera)((seen, at, axes, middle, wanted))
+    no_parts = lambda *_: ComponentParts(*zero)
+    parts_of_camera = partial(_parts, key.model, key.free, settings)
+    of_camera = lambda camera: jax.lax.cond(
+        jnp.any(camera[-1][1:]), parts_of_camera, no_parts, *camera
+    )
+    return key.for_every(of_camera)((sightings, unknowns, axes, middle, is_wanted))
 
 
 @partial(compile_once, static=(0, 1))
 def scatter_of_portion(
     key: ProgramKey,
     settings: CorrelationSettings,
-    seen: Sightings,
-    at: CameraUnknowns,
+    sightings: Sightings,
+    unknowns: CameraUnknowns,
     theta: Float[AnyArray, "cameras k"],
 ) -> Float[Array, "cameras k k"]:
     """The covariance of the forms q of every camera of a portion under errors of the sizes θ."""
 
-    def drawn(given: tuple[Sightings, CameraUnknowns, Array]) -> Float[Array, "k k"]:
-        seen, at, theta = given
-        spans, roots = spans_and_roots(key.model, key.free, settings, seen, at)
+    def covariance_of_draws(camera: tuple[Sightings, CameraUnknowns, Array]) -> Float[Array, "k k"]:
+        sightings, unknowns, theta = camera
+        spans, roots = spans_and_roots(key.model, key.free, settings, sightings, unknowns)
         spans, roots = in_single_precision((spans, roots))
         e = roots.draw(
             in_single_precision(theta), jax.random.key(settings.estimation.seed), SUMS.draws
         )
         q = roots.forms(spans.residuals(e)).astype(float)
-        away = q - q.mean(0)
-        return away.T @ away / (SUMS.draws - 1)
+        deviation = q - q.mean(0)
+        return deviation.T @ deviation / (SUMS.draws - 1)
 
-    def of_camera(given: tuple[Sightings, CameraUnknowns, Array]) -> Float[Array, "k k"]:
-        none = lambda _: jnp.zeros((len(COMPONENTS),) * 2)
-        return jax.lax.cond(jnp.any(given[2] > 0), drawn, none, given)
+    def of_camera(camera: tuple[Sightings, CameraUnknowns, Array]) -> Float[Array, "k k"]:
+        no_scatter = lambda _: jnp.zeros((len(COMPONENTS),) * 2)
+        return jax.lax.cond(jnp.any(camera[2] > 0), covariance_of_draws, no_scatter, camera)
 
-    return key.for_every(of_camera)((seen, at, theta))
+    return key.for_every(of_camera)((sightings, unknowns, theta))
 
 
 def _forms(
-    model: CameraModel, settings: CorrelationSettings, seen: Sightings, at: CameraUnknowns
+    model: CameraModel,
+    settings: CorrelationSettings,
+    sightings: Sightings,
+    unknowns: CameraUnknowns,
 ) -> ComponentForms:
     """vᵀV_k·v of one camera, with the correlations V of errors along tracks and of given points,
     without their roots."""
-    used = jnp.asarray(seen.weight)
-    by_axis, by_point = effects_of_object_points(model, seen, at)
+    is_used = jnp.asarray(sightings.weight)
+    by_axis, by_point = effects_of_object_points(model, sightings, unknowns)
     v = by_axis.swapaxes(0, 1)
-    on_sensor, place = places_on_sensor(computed_coordinates(seen, v), used)
-    of_view = jnp.einsum("vapc,vap->vc", displacements_by_view(on_sensor, used), v)
-    by_view = [jnp.sum(of_view[:, of] ** 2) for of in BY_VIEW]
-    K = correlation_of_views(at, used, settings.reach, seen)
+    on_sensor, place = places_on_sensor(computed_coordinates(sightings, v), is_used)
+    of_view = jnp.einsum("vapc,vap->vc", displacements_by_view(on_sensor, is_used), v)
+    by_view = [jnp.sum(of_view[:, columns] ** 2) for columns in BY_VIEW]
+    K = correlation_of_views(unknowns, is_used, settings.reach, sightings)
     along_tracks = jnp.sum(jnp.einsum("vw,wap->vap", K, v) * v)
     # Sums over leading axes, which are vectorised.
-    given, squares = given_points(used), jnp.sum(by_point**2, 1)
-    K = correlation_of_given(jnp.asarray(seen.point), used, settings)
-    point = jnp.sum(by_point * by_axis, (1, 2)) * given
-    of_axes = jnp.sum((point @ K) * point, 1) / mean_squares_of_given(used, squares)
-    of_points = [jnp.sum(of_axes[of]) for of in GIVEN_AXES]
-    field = field_form(place, used, v, settings)
+    is_given, squares = given_points(is_used), jnp.sum(by_point**2, 1)
+    K = correlation_of_given(jnp.asarray(sightings.point), is_used, settings)
+    point = jnp.sum(by_point * by_axis, (1, 2)) * is_given
+    of_axes = jnp.sum((point @ K) * point, 1) / mean_squares_of_given(is_used, squares)
+    of_points = [jnp.sum(of_axes[columns]) for columns in GIVEN_AXES]
+    field = field_form(place, is_used, v, settings)
     q = jnp.stack([jnp.sum(v**2), field, *by_view, along_tracks, *of_points])
-    parts: list[Any] = [q, jnp.sum(given).astype(float)]
+    parts: list[Any] = [q, jnp.sum(is_given).astype(float)]
     return ComponentForms(*parts)
 
 
@@ -195,43 +200,48 @@ def _parts(
     model: CameraModel,
     free: tuple[int, ...],
     settings: CorrelationSettings,
-    seen: Sightings,
-    at: CameraUnknowns,
+    sightings: Sightings,
+    unknowns: CameraUnknowns,
     axes: Float[Array, "3 3"],
     middle: Float[Array, "3"],
-    wanted: Bool[Array, " k"],
+    is_wanted: Bool[Array, " k"],
 ) -> ComponentParts:
     """`parts_of_portion` of one camera."""
-    spans = spans_of_camera(model, free, seen, at)
-    used = jnp.asarray(seen.weight)
-    on_sensor, place = places_on_sensor(computed_coordinates(seen, spans.v), used)
+    spans = spans_of_camera(model, free, sightings, unknowns)
+    is_used = jnp.asarray(sightings.weight)
+    on_sensor, place = places_on_sensor(computed_coordinates(sightings, spans.v), is_used)
 
     def of_field() -> Covariances:
-        splines, octaves, _ = fields_of_camera(place, used, settings)
-        return covariances_of_columns(*onto_field(spans, splines, octaves), 2 * used.sum())
+        splines, octaves, _ = fields_of_camera(place, is_used, settings)
+        return covariances_of_columns(*onto_field(spans, splines, octaves), 2 * is_used.sum())
 
     def of_given(axes: slice) -> Covariances:
-        K = correlation_of_given(jnp.asarray(seen.point), used, settings)
-        by_point = effects_of_given(used, spans.by_point)[..., axes]
+        K = correlation_of_given(jnp.asarray(sightings.point), is_used, settings)
+        by_point = effects_of_given(is_used, spans.by_point)[..., axes]
         return covariances_of_given(spans, by_point, jnp.linalg.cholesky(K))
 
     def along_tracks() -> Covariances:
-        K = correlation_of_views(at, used, settings.reach, seen)
-        return covariances_along_tracks(spans, used, K)
+        K = correlation_of_views(unknowns, is_used, settings.reach, sightings)
+        return covariances_along_tracks(spans, is_used, K)
 
     views, k = spans.W.shape[0], spans.Z.shape[1]
     zero = (views, POSE, POSE), (views, POSE, k), (k, k), ()
-    none = lambda: Covariances(*map(jnp.zeros, zero))
-    if_wanted = lambda c, function: jax.lax.cond(wanted[c], function, none)
-    found = [
-        none(),
+    no_covariances = lambda: Covariances(*map(jnp.zeros, zero))
+    if_wanted = lambda c, function: jax.lax.cond(is_wanted[c], function, no_covariances)
+    component_covariances = [
+        no_covariances(),
         if_wanted(FIELD, of_field),
-        *covariances_by_view(spans, displacements_by_view(on_sensor, used)),
+        *covariances_by_view(spans, displacements_by_view(on_sensor, is_used)),
         if_wanted(TRACKS, along_tracks),
-        *(if_wanted(GIVEN + n, partial(of_given, of)) for n, of in enumerate(GIVEN_AXES)),
+        *(
+            if_wanted(GIVEN + n, partial(of_given, axes_of_component))
+            for n, axes_of_component in enumerate(GIVEN_AXES)
+        ),
     ]
-    interior = jnp.stack([covariance_of_interior(spans, c) for c in found])
-    slopes = jax.vmap(exterior_slopes, (0, 0, None, None))(at.rotation, at.shift, axes, middle)
-    pose = jnp.stack([variances_of_poses(spans, slopes, c) for c in found])
-    parts: list[Any] = [jnp.stack([c.remaining for c in found]), interior, pose]
+    interior = jnp.stack([covariance_of_interior(spans, c) for c in component_covariances])
+    slopes = jax.vmap(exterior_slopes, (0, 0, None, None))(
+        unknowns.rotation, unknowns.shift, axes, middle
+    )
+    pose = jnp.stack([variances_of_poses(spans, slopes, c) for c in component_covariances])
+    parts: list[Any] = [jnp.stack([c.remaining for c in component_covariances]), interior, pose]
     return ComponentParts(*parts)

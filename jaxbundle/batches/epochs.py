@@ -20,16 +20,16 @@ MIN_SHARED_EPOCHS = 3
 
 def contradicting(
     rms: Float[np.ndarray, " epochs"],
-    seen: Bool[np.ndarray, " epochs"],
+    is_seen: Bool[np.ndarray, " epochs"],
     shared: Bool[np.ndarray, " epochs"],
 ) -> Int[np.ndarray, " bad"]:
-    """Epochs that contradict the mounting; `rms` in pixels, `seen` by any camera, `shared` by
+    """Epochs that contradict the mounting; `rms` in pixels, `is_seen` by any camera, `shared` by
     several."""
     if not shared.any():
         return np.zeros(0, int)
     # An epoch contradicts from three times the median RMS of all, and from a pixel. Larger: small
     # movements between the exposures remain; smaller: epochs of blurred photographs are lost.
-    limit = max(3.0 * float(np.median(rms[seen])), 1.0)
+    limit = max(3.0 * float(np.median(rms[is_seen])), 1.0)
     rms = np.where(shared, rms, 0.0)
     # At once only those above half of the worst, which affects the others through the mounting.
     return np.flatnonzero(rms > max(limit, 0.5 * rms.max()))
@@ -45,39 +45,45 @@ def epoch_keys(
 
     **Raises:** `InputError` if neither pairs them.
     """
-    whole = lambda name: re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1])
+    without_suffix = lambda name: re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1])
 
     def number(name: str) -> str:
-        found = re.findall(r"\d+", whole(name))
-        return found[-1].lstrip("0") or "0" if found else ""
+        numbers = re.findall(r"\d+", without_suffix(name))
+        return numbers[-1].lstrip("0") or "0" if numbers else ""
 
     # Equal names first: numbers of two cameras may be equal by chance.
     some = None
-    for key in (whole, number):
-        keys = {camera: [key(name) for name in given] for camera, given in names.items()}
-        once = all("" not in k and len({*k}) == len(k) for k in keys.values())
-        first, *others = ({*k} for k in keys.values())
-        if once and all(
-            len(first & other) >= min(MIN_SHARED_EPOCHS, len(first)) for other in others
+    for key in (without_suffix, number):
+        keys = {
+            camera: [key(name) for name in names_of_camera]
+            for camera, names_of_camera in names.items()
+        }
+        are_unique = all("" not in k and len({*k}) == len(k) for k in keys.values())
+        keys_of_first, *keys_of_others = ({*k} for k in keys.values())
+        if are_unique and all(
+            len(keys_of_first & keys_of_other) >= min(MIN_SHARED_EPOCHS, len(keys_of_first))
+            for keys_of_other in keys_of_others
         ):
             return keys
-        if once and len(keys) > 2 and _connected(keys):
+        if are_unique and len(keys) > 2 and _connected(keys):
             return keys
-        if once and some is None and not connected and _any_shared(keys):
+        if are_unique and some is None and not connected and _any_shared(keys):
             some = keys
     if some is not None:
         return some
-    shown = "; ".join(f"{camera}: {list_some(given, 2)}" for camera, given in names.items())
+    names_in_words = "; ".join(
+        f"{camera}: {list_some(names_of_camera, 2)}" for camera, names_of_camera in names.items()
+    )
     raise InputError(
-        f"the photographs of the cameras cannot be paired by their names ({shown}): name "
+        f"the photographs of the cameras cannot be paired by their names ({names_in_words}): name "
         "simultaneous ones alike, or give them the same last number"
     )
 
 
 def _any_shared(keys: Mapping[str, Sequence[str]]) -> bool:
     """Whether any two cameras share an epoch."""
-    each = [{*k} for k in keys.values()]
-    return len(set().union(*each)) < sum(map(len, each))
+    keys_of_each = [{*k} for k in keys.values()]
+    return len(set().union(*keys_of_each)) < sum(map(len, keys_of_each))
 
 
 def _connected(keys: Mapping[str, Sequence[str]]) -> bool:
@@ -86,8 +92,9 @@ def _connected(keys: Mapping[str, Sequence[str]]) -> bool:
     reached = [next(iter(sets))]
     for name in reached:
         reached += [
-            other
-            for other in sets
-            if other not in reached and len(sets[name] & sets[other]) >= MIN_SHARED_EPOCHS
+            other_camera
+            for other_camera in sets
+            if other_camera not in reached
+            and len(sets[name] & sets[other_camera]) >= MIN_SHARED_EPOCHS
         ]
     return len(reached) == len(sets)

@@ -71,9 +71,9 @@ def covariances(spans: Spans, roots: Roots, of: OntoSpans) -> list[Covariances]:
     """Of all components."""
     W, k = spans.W, spans.Z.shape[1]
     rows = 2 * roots.used.sum()
-    own = products_of_rows(W, W)
+    products_of_own = products_of_rows(W, W)
     return [
-        Covariances(own, jnp.zeros((*W.shape[:2], k)), jnp.eye(k), rows),
+        Covariances(products_of_own, jnp.zeros((*W.shape[:2], k)), jnp.eye(k), rows),
         covariances_of_columns(of.WB, of.ZB, rows),
         *covariances_by_view(spans, roots.by_view),
         covariances_along_tracks(spans, roots.used, roots.views @ roots.views.T),
@@ -97,25 +97,25 @@ def covariances_by_view(
     """Of the components by view."""
     WF = jnp.einsum("veap,vapc->vec", spans.W, by_view)
     ZF = jnp.einsum("vkap,vapc->vkc", spans.Z, by_view)
-    found = []
-    for one in BY_VIEW:
-        w, z = WF[..., one], ZF[..., one]
+    by_component = []
+    for columns in BY_VIEW:
+        w, z = WF[..., columns], ZF[..., columns]
         wz = jnp.einsum("vec,vkc->vek", w, z)
-        trace = jnp.sum(by_view[..., one] ** 2)
+        trace = jnp.sum(by_view[..., columns] ** 2)
         zz = jnp.einsum("vkc,vlc->kl", z, z)
-        found.append(Covariances(w @ w.swapaxes(1, 2), wz, zz, trace))
-    return found
+        by_component.append(Covariances(w @ w.swapaxes(1, 2), wz, zz, trace))
+    return by_component
 
 
 def covariances_along_tracks(
-    spans: Spans, used: Float[Array, "views points"], K: Float[Array, "views views"]
+    spans: Spans, is_used: Float[Array, "views points"], K: Float[Array, "views views"]
 ) -> Covariances:
     """Of errors along tracks, of the correlation K of the views, which is 1 in a view."""
     W, Z = spans.W, spans.Z
-    own = products_of_rows(W, W)
-    near = jnp.einsum("vw,wkap->vkap", K, Z)
-    wz, zz = jnp.einsum("veap,vkap->vek", W, near), jnp.einsum("vkap,vlap->kl", Z, near)
-    return Covariances(own, wz, zz, 2 * used.sum())
+    products_of_own = products_of_rows(W, W)
+    correlated = jnp.einsum("vw,wkap->vkap", K, Z)
+    wz, zz = jnp.einsum("veap,vkap->vek", W, correlated), jnp.einsum("vkap,vlap->kl", Z, correlated)
+    return Covariances(products_of_own, wz, zz, 2 * is_used.sum())
 
 
 def covariances_of_given(
@@ -131,8 +131,8 @@ def covariances_of_given(
 
 def covariance_of_interior(spans: Spans, c: Covariances) -> Float[Array, "k k"]:
     """The covariance of the interior orientation, R⁻ᵀ·ZVZᵀ·R⁻¹."""
-    back = lambda b: jax.scipy.linalg.solve_triangular(spans.R.T, b, lower=False)
-    return back(back(c.zz).T)
+    solve_transposed = lambda b: jax.scipy.linalg.solve_triangular(spans.R.T, b, lower=False)
+    return solve_transposed(solve_transposed(c.zz).T)
 
 
 def variances_of_poses(

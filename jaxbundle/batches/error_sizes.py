@@ -53,13 +53,13 @@ def batch_errors(
     sums: BatchSums,
     views: np.ndarray,
     points: np.ndarray,
-    together: bool,
+    common: bool,
     programs: BatchPrograms,
     settings: CorrelationSettings = DEFAULTS,
 ) -> BatchErrors:
     """σ of all cameras under errors that their image points share.
 
-    **Arguments:** `sums` of all cameras; `views` and image `points` used of each; `together`: one
+    **Arguments:** `sums` of all cameras; `views` and image `points` used of each; `common`: one
     set of sizes for all cameras, else one for each; `programs`: of components whose size is not
     zero. A camera with fewer than `settings.min_images` views has no components by view, with fewer
     image points no field, with fewer given points than `settings.min_given_points` none of these.
@@ -69,29 +69,29 @@ def batch_errors(
     for n in np.flatnonzero(sums.traced).tolist():
         cubes[n] = with_traces(traces.cubes[n], traces.T[n])
     sums = sums._replace(traces=traces._replace(cubes=cubes))
-    shown = _shown(sums, views, points, settings)
+    can_show = _can_show(sums, views, points, settings)
     critical = settings.estimation.critical(len(COMPONENTS) - 1)
-    find = _common_sizes if together else _sizes_of_each
-    theta, parts = find(sums, shown, critical, programs)
+    find = _common_sizes if common else _sizes_of_each
+    theta, parts = find(sums, can_show, critical, programs)
     # A camera without sizes has no σ: zero would read as without any error.
-    none = np.isnan(theta).all(1, keepdims=True)
-    used = np.where(none, np.nan, np.nan_to_num(theta))
-    covariance = np.einsum("nk,nkij->nij", parts.factor * used, parts.interior)
-    variance = np.einsum("nk,nkvi->nvi", parts.factor * used, parts.pose)
+    has_none = np.isnan(theta).all(1, keepdims=True)
+    theta_used = np.where(has_none, np.nan, np.nan_to_num(theta))
+    covariance = np.einsum("nk,nkij->nij", parts.factor * theta_used, parts.interior)
+    variance = np.einsum("nk,nkvi->nvi", parts.factor * theta_used, parts.pose)
     return BatchErrors(np.sqrt(theta), covariance, variance)
 
 
-def _shown(
+def _can_show(
     sums: BatchSums, views: np.ndarray, points: np.ndarray, settings: CorrelationSettings
 ) -> Bool[np.ndarray, "cameras k"]:
     """Which components every camera can show."""
-    shown = np.ones(sums.forms.q.shape, bool)
-    shown[:, FIELD:TRACKS] = (views >= settings.min_images)[:, None]
-    shown[:, FIELD] &= points >= settings.min_points_of_field
-    shown[:, TRACKS] = views > 1
-    shown[:, GIVEN:] = (sums.forms.given >= settings.min_given_points)[:, None]
+    can_show = np.ones(sums.forms.q.shape, bool)
+    can_show[:, FIELD:TRACKS] = (views >= settings.min_images)[:, None]
+    can_show[:, FIELD] &= points >= settings.min_points_of_field
+    can_show[:, TRACKS] = views > 1
+    can_show[:, GIVEN:] = (sums.forms.given >= settings.min_given_points)[:, None]
     sound = np.isfinite(sums.forms.q).all(1) & np.isfinite(sums.traces.T).all((1, 2))
-    return shown & np.asarray(sound)[:, None]
+    return can_show & np.asarray(sound)[:, None]
 
 
 class SizedParts(NamedTuple):
@@ -116,80 +116,94 @@ class SizedParts(NamedTuple):
         return SizedParts(factor, interior, pose)
 
     def tables(
-        self, some: Int[np.ndarray, " n"], of: Int[np.ndarray, " k"]
+        self, cameras: Int[np.ndarray, " n"], components: Int[np.ndarray, " k"]
     ) -> list[Float[np.ndarray, "n k unknowns"]]:
         """The variances that components of θ = 1 give the unknowns of some cameras, and of their
         views."""
-        block = np.ix_(some, of)
+        block = np.ix_(cameras, components)
         interior = np.diagonal(self.interior[block], axis1=2, axis2=3)
-        pose = self.pose[block].reshape(len(some), len(of), -1)
+        pose = self.pose[block].reshape(len(cameras), len(components), -1)
         return [np.nan_to_num(interior), np.nan_to_num(pose)]
 
 
 def _sizes_of_each(
-    sums: BatchSums, shown: Bool[np.ndarray, "cameras k"], critical: float, programs: BatchPrograms
+    sums: BatchSums,
+    can_show: Bool[np.ndarray, "cameras k"],
+    critical: float,
+    programs: BatchPrograms,
 ) -> tuple[Float[np.ndarray, "cameras k"], SizedParts]:
     """θ of every camera from its own residuals."""
     (T, cubes), q = sums.traces, sums.forms.q
-    theta = np.full(shown.shape, np.nan)
-    for n in np.flatnonzero(shown[:, 0]).tolist():
-        of = np.flatnonzero(shown[n])
-        block = np.ix_(of, of), np.ix_(of, of, of)
+    theta = np.full(can_show.shape, np.nan)
+    for n in np.flatnonzero(can_show[:, 0]).tolist():
+        components = np.flatnonzero(can_show[n])
+        block = np.ix_(components, components), np.ix_(components, components, components)
         equations = SizeEquations(T[n][block[0]], False, critical, cubes[n][block[1]])
-        theta[n, of] = equations.solve(q[n][of])[0]
-    used: np.ndarray = np.nan_to_num(theta) > 0
-    shared = np.asarray(used[:, 1:].any(1))
+        theta[n, components] = equations.solve(q[n][components])[0]
+    is_used: np.ndarray = np.nan_to_num(theta) > 0
+    shared = np.asarray(is_used[:, 1:].any(1))
     if not shared.any():
         return theta, SizedParts.of(sums, None)
-    parts = SizedParts.of(sums, programs.parts(used & shared[:, None]))
+    parts = SizedParts.of(sums, programs.parts(is_used & shared[:, None]))
     forms = programs.scatter(np.where(shared[:, None], np.nan_to_num(theta), 0.0))
     for n in np.flatnonzero(shared).tolist():
-        of = np.flatnonzero(shown[n])
-        block = np.ix_(of, of)
-        known = theta[n, of], T[n][block], forms[n][block]
-        tables = [table[0] for table in parts.tables(np.array([n]), of)]
-        parts.factor[n, of] = widening(*known, tables)
+        components = np.flatnonzero(can_show[n])
+        block = np.ix_(components, components)
+        sizes_and_traces = theta[n, components], T[n][block], forms[n][block]
+        tables = [table[0] for table in parts.tables(np.array([n]), components)]
+        parts.factor[n, components] = widening(*sizes_and_traces, tables)
     return theta, parts
 
 
 def _common_sizes(
-    sums: BatchSums, shown: Bool[np.ndarray, "cameras k"], critical: float, programs: BatchPrograms
+    sums: BatchSums,
+    can_show: Bool[np.ndarray, "cameras k"],
+    critical: float,
+    programs: BatchPrograms,
 ) -> tuple[Float[np.ndarray, "cameras k"], SizedParts]:
     """The same with one set of sizes, from the cameras that show most components, which others
     take over; θ of the independent part is that of every camera."""
     (T, cubes), q = sums.traces, sums.forms.q
-    theta = np.full(shown.shape, np.nan)
-    known = np.flatnonzero(shown[:, 0])
+    theta = np.full(can_show.shape, np.nan)
+    known_cameras = np.flatnonzero(can_show[:, 0])
     # E q_0 = Σ θ_k·tr(M·V_k): what the common sizes leave of a camera's own vᵀv
-    white = lambda shared: np.clip((q[known, 0] - shared) / sums.redundancy[known], 0, None)
-    if not (shown[:, 0] & sums.traced).any():
+    white = lambda shared: np.clip(
+        (q[known_cameras, 0] - shared) / sums.redundancy[known_cameras], 0, None
+    )
+    if not (can_show[:, 0] & sums.traced).any():
         # Without any traces independent errors alone.
-        theta[known, 0] = white(0.0)
+        theta[known_cameras, 0] = white(0.0)
         return theta, SizedParts.of(sums, None)
-    of = np.flatnonzero(shown[np.argmax(shown.sum(1) * sums.traced)])
-    block = np.ix_(of, of)
-    good = np.flatnonzero(shown[:, of].all(1))
+    components = np.flatnonzero(can_show[np.argmax(can_show.sum(1) * sums.traced)])
+    block = np.ix_(components, components)
+    good = np.flatnonzero(can_show[:, components].all(1))
     traced = good[sums.traced[good]]
     # q is the sum of all cameras, T of those with traces: scaled to as many
     times = len(good) / len(traced)
-    together = times * T[traced].sum(0)[block]
-    of_three = times * cubes[traced].sum(0)[np.ix_(of, of, of)]
-    common = SizeEquations(together, False, critical, of_three).solve(q[good].sum(0)[of])[0]
-    theta[np.ix_(known, of)] = common
+    sum_of_traces = times * T[traced].sum(0)[block]
+    of_three = times * cubes[traced].sum(0)[np.ix_(components, components, components)]
+    common = SizeEquations(sum_of_traces, False, critical, of_three).solve(
+        q[good].sum(0)[components]
+    )[0]
+    theta[np.ix_(known_cameras, components)] = common
     if not common[1:].any():
-        theta[known, 0] = white(0.0)
+        theta[known_cameras, 0] = white(0.0)
         return theta, SizedParts.of(sums, None)
-    wanted = np.zeros(shown.shape, bool)
-    wanted[np.ix_(known, of)] = common > 0
-    found = programs.parts(wanted)
-    theta[known, 0] = white(found.remaining[known][:, of[1:]] @ common[1:])
-    parts = SizedParts.of(sums, found)
+    is_wanted = np.zeros(can_show.shape, bool)
+    is_wanted[np.ix_(known_cameras, components)] = common > 0
+    parts_found = programs.parts(is_wanted)
+    theta[known_cameras, 0] = white(
+        parts_found.remaining[known_cameras][:, components[1:]] @ common[1:]
+    )
+    parts = SizedParts.of(sums, parts_found)
     if len(traced) >= 2 * SUMS.draws:
         # q of that many cameras are draws themselves, of errors as they are
-        away = q[traced][:, of] - T[traced][:, of][..., of] @ common
-        forms = times * away.T @ away
+        deviation = q[traced][:, components] - T[traced][:, components][..., components] @ common
+        forms = times * deviation.T @ deviation
     else:
         forms = times * programs.scatter(np.nan_to_num(theta))[traced].sum(0)[block]
-    tables = parts.tables(known, of)
-    parts.factor[np.ix_(known, of)] = widenings(theta[np.ix_(known, of)], together, forms, tables)
+    tables = parts.tables(known_cameras, components)
+    parts.factor[np.ix_(known_cameras, components)] = widenings(
+        theta[np.ix_(known_cameras, components)], sum_of_traces, forms, tables
+    )
     return theta, parts

@@ -106,8 +106,8 @@ class Roots(eqx.Module):
         """The same from their products."""
         field, of_view, track, point = products
         square = lambda a: jnp.sum(a**2, range(1, a.ndim))
-        parts = [square(u), square(field), *(square(of_view[..., of]) for of in BY_VIEW)]
-        of_points = [square(point[:, of]) for of in GIVEN_AXES]
+        parts = [square(u), square(field), *(square(of_view[..., columns]) for columns in BY_VIEW)]
+        of_points = [square(point[:, columns]) for columns in GIVEN_AXES]
         return jnp.stack([*parts, square(track), *of_points], 1)
 
     def along_tracks(self, z: Float[Array, "r views 2 points"]) -> Array:
@@ -143,24 +143,24 @@ def in_single_precision(tree: Any) -> Any:
 
 
 def computed_coordinates(
-    seen: Sightings, v: Float[Array, "views 2 points"]
+    sightings: Sightings, v: Float[Array, "views 2 points"]
 ) -> Float[Array, "views points 2"]:
     """Computed image coordinates, in which effects are given: they have no share of the residuals
     (`correlated_errors.image_rows`)."""
-    return jnp.asarray(seen.xy) + v.swapaxes(1, 2)
+    return jnp.asarray(sightings.xy) + v.swapaxes(1, 2)
 
 
 def spans_of_camera(
-    model: CameraModel, free: tuple[int, ...], seen: Sightings, at: CameraUnknowns
+    model: CameraModel, free: tuple[int, ...], sightings: Sightings, unknowns: CameraUnknowns
 ) -> Spans:
-    columns = [jnp.stack(axis, 1) for axis in design(model, free, seen, at)]
+    columns = [jnp.stack(axis, 1) for axis in design(model, free, sightings, unknowns)]
     rows = jnp.stack(columns, 2)  # [views, 6 + k + 1, 2, points]
     E, J, v = rows[:, :POSE], rows[:, POSE:-1], rows[:, -1]
-    W, L = _orthonormal(E, jnp.asarray(seen.weight))
+    W, L = _orthonormal(E, jnp.asarray(sightings.weight))
     WJ = products_of_rows(W, J)
     Z, R = _orthonormal_of_all(J - jnp.einsum("vek,veap->vkap", WJ, W))
     # ray = M·X + t: of a point as of the shift, turned.
-    turns = jax.vmap(matrix_from_quaternion)(at.rotation)
+    turns = jax.vmap(matrix_from_quaternion)(unknowns.rotation)
     by_point = [sum(turns[:, i, j, None, None] * E[:, i] for i in range(3)) for j in range(3)]
     return Spans(W, Z, L, R, WJ, v, jnp.stack(by_point, -1))
 
@@ -177,30 +177,32 @@ def spans_and_roots(
     model: CameraModel,
     free: tuple[int, ...],
     settings: CorrelationSettings,
-    seen: Sightings,
-    at: CameraUnknowns,
+    sightings: Sightings,
+    unknowns: CameraUnknowns,
 ) -> tuple[Spans, Roots]:
-    used = jnp.asarray(seen.weight)
-    spans = spans_of_camera(model, free, seen, at)
-    on_sensor, place = places_on_sensor(computed_coordinates(seen, spans.v), used)
-    splines, octaves, gram = fields_of_camera(place, used, settings)
-    by_view = displacements_by_view(on_sensor, used)
-    by_point = effects_of_given(used, spans.by_point)
-    points = jnp.linalg.cholesky(correlation_of_given(jnp.asarray(seen.point), used, settings))
-    K = correlation_of_views(at, used, settings.reach, seen)
+    is_used = jnp.asarray(sightings.weight)
+    spans = spans_of_camera(model, free, sightings, unknowns)
+    on_sensor, place = places_on_sensor(computed_coordinates(sightings, spans.v), is_used)
+    splines, octaves, gram = fields_of_camera(place, is_used, settings)
+    by_view = displacements_by_view(on_sensor, is_used)
+    by_point = effects_of_given(is_used, spans.by_point)
+    points = jnp.linalg.cholesky(
+        correlation_of_given(jnp.asarray(sightings.point), is_used, settings)
+    )
+    K = correlation_of_views(unknowns, is_used, settings.reach, sightings)
     views = root_of_views(K)
-    return spans, Roots(used, splines, octaves, gram, by_view, views, by_point, points)
+    return spans, Roots(is_used, splines, octaves, gram, by_view, views, by_point, points)
 
 
 def _orthonormal(
-    E: Float[Array, "views 6 2 points"], used: Float[Array, "views points"]
+    E: Float[Array, "views 6 2 points"], is_used: Float[Array, "views points"]
 ) -> tuple[Float[Array, "views 6 2 points"], Float[Array, "views 6 6"]]:
     """Rows W that span those of every view, and L of EEᵀ = L·Lᵀ; of views without points W is
     zero."""
     N = products_of_rows(E, E)
-    none = ~(used.sum(1) > 0)
-    scale = jax.lax.rsqrt(jnp.where(none[:, None], 1.0, jnp.diagonal(N, axis1=1, axis2=2)))
-    N = N * scale[:, :, None] * scale[:, None, :] + none[:, None, None] * jnp.eye(POSE)
+    has_none = ~(is_used.sum(1) > 0)
+    scale = jax.lax.rsqrt(jnp.where(has_none[:, None], 1.0, jnp.diagonal(N, axis1=1, axis2=2)))
+    N = N * scale[:, :, None] * scale[:, None, :] + has_none[:, None, None] * jnp.eye(POSE)
     L = jnp.linalg.cholesky(N)
     eye = jnp.broadcast_to(jnp.eye(POSE), N.shape)
     inverse = jax.scipy.linalg.solve_triangular(L, eye, lower=True) * scale[:, None, :]

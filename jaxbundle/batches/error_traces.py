@@ -77,11 +77,11 @@ class FewColumns(NamedTuple):
         )
         mixed = mixed.swapaxes(1, 2).reshape(views, columns, -1)
         mixed = mixed - jnp.einsum("ves,vec->vcs", WB, WF) - jnp.einsum("ks,vkc->vcs", ZB, ZF)
-        own = jnp.einsum("vapc,vapd->vcd", roots.by_view, roots.by_view)
-        own = own - jnp.einsum("vec,ved->vcd", WF, WF)
+        products_of_own = jnp.einsum("vapc,vapd->vcd", roots.by_view, roots.by_view)
+        products_of_own = products_of_own - jnp.einsum("vec,ved->vcd", WF, WF)
         diagonal = jnp.arange(views)
         by_view = -jnp.einsum("vkc,wkd->vcwd", ZF, ZF)
-        by_view = by_view.at[diagonal, :, diagonal, :].add(own)
+        by_view = by_view.at[diagonal, :, diagonal, :].add(products_of_own)
         flat = views * columns
         return FewColumns(field, mixed.reshape(flat, -1), by_view.reshape(flat, flat))
 
@@ -90,11 +90,11 @@ class FewColumns(NamedTuple):
         of_view = jnp.zeros((5, len(COMPONENTS)))
         for k, columns in enumerate(BY_VIEW, FIELD + 1):
             of_view = of_view.at[columns, k].set(1.0)
-        each = jnp.tile(of_view, (len(self.by_view) // 5, 1))
-        found = each.T @ (self.by_view * other.by_view) @ each
-        with_field = each.T @ jnp.sum(self.mixed * other.mixed, 1)
-        found = found.at[FIELD].add(with_field).at[:, FIELD].add(with_field)
-        return found.at[FIELD, FIELD].add(jnp.sum(self.field * other.field))
+        component_of_column = jnp.tile(of_view, (len(self.by_view) // 5, 1))
+        sums = component_of_column.T @ (self.by_view * other.by_view) @ component_of_column
+        with_field = component_of_column.T @ jnp.sum(self.mixed * other.mixed, 1)
+        sums = sums.at[FIELD].add(with_field).at[:, FIELD].add(with_field)
+        return sums.at[FIELD, FIELD].add(jnp.sum(self.field * other.field))
 
 
 def random_signs(settings: CorrelationSettings, views: int, points: int) -> tuple[Array, Array]:
@@ -120,33 +120,35 @@ def traces_of_components(spans: Spans, roots: Roots, signs: tuple[Array, Array])
         cubes = cubes.at[k].set(S.sums(through))
     # Of random combinations of the columns of the others.
     masks = [jnp.zeros((3, 1)).at[axes].set(1.0) for axes in GIVEN_AXES]
-    errors = [roots.along_tracks(signs[0]), *(roots.of_points(signs[1] * one) for one in masks)]
+    errors = [roots.along_tracks(signs[0]), *(roots.of_points(signs[1] * mask) for mask in masks)]
     remaining = jnp.stack([c.remaining for c in covariances(spans, roots, projected)])
     spans, roots = in_single_precision((spans, roots))
     for k, e in zip(range(TRACKS, count), in_single_precision(errors)):
         u = spans.residuals(e)
         products = roots.products(u)
-        found = roots.forms_of(u, products).mean(0)
-        T = T.at[k].set(found)
+        traces = roots.forms_of(u, products).mean(0)
+        T = T.at[k].set(traces)
         flat = [x.reshape(SUMS.probes, -1) / jnp.sqrt(SUMS.probes) for x in products[:2]]
         pairs = FewColumns(flat[0].T @ flat[0], flat[1].T @ flat[0], flat[1].T @ flat[1])
         cubes = cubes.at[k].set(S.sums(pairs))
         # Half of them again: M·F·(Fᵀ·M·F·ξ).
-        half = [x[: SUMS.probes // 2] for x in products]
+        half_of_probes = [x[: SUMS.probes // 2] for x in products]
         e = (
-            roots.along_tracks(half[2])
+            roots.along_tracks(half_of_probes[2])
             if k == TRACKS
-            else roots.of_points(half[3] * in_single_precision(masks[k - GIVEN]))
+            else roots.of_points(half_of_probes[3] * in_single_precision(masks[k - GIVEN]))
         )
         z = spans.residuals(e)
-        more = [x * y for x, y in zip(roots.products(z), half)]
-        own = jnp.zeros(count).at[k].set(jnp.sum(z**2)).at[FIELD].set(jnp.sum(more[0]))
+        products_of_probes = [x * y for x, y in zip(roots.products(z), half_of_probes)]
+        traces_of_k = (
+            jnp.zeros(count).at[k].set(jnp.sum(z**2)).at[FIELD].set(jnp.sum(products_of_probes[0]))
+        )
         for j, columns in enumerate(BY_VIEW, FIELD + 1):
-            own = own.at[j].set(jnp.sum(more[1][..., columns]))
-        cubes = cubes.at[k, k].set(own / (SUMS.probes // 2))
+            traces_of_k = traces_of_k.at[j].set(jnp.sum(products_of_probes[1][..., columns]))
+        cubes = cubes.at[k, k].set(traces_of_k / (SUMS.probes // 2))
     # Of two of them from the combinations of both.
-    both = (T[TRACKS:, TRACKS:] + T[TRACKS:, TRACKS:].T) / 2
-    T = T.at[:, TRACKS:].set(T[TRACKS:].T).at[TRACKS:, TRACKS:].set(both)
+    symmetric = (T[TRACKS:, TRACKS:] + T[TRACKS:, TRACKS:].T) / 2
+    T = T.at[:, TRACKS:].set(T[TRACKS:].T).at[TRACKS:, TRACKS:].set(symmetric)
     T = T.astype(float).at[0].set(remaining).at[:, 0].set(remaining)
     parts: list[Any] = [T, cubes.astype(float)]
     return ComponentTraces(*parts)

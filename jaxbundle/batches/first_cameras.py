@@ -84,27 +84,27 @@ def first_cameras(
 ) -> list[FirstCamera]:
     """The first attempt with a solution, possibly weak, of every camera; the last one if there is
     none. `xy` in pixels, NaN where a point is missing."""
-    tried = _attempts(model, tuple(free), image_size)
-    found: dict[int, FirstCamera] = {}
-    left = np.arange(len(xy))
-    shape = get_model(tried[0][0])
+    attempts = _attempts(model, tuple(free), image_size)
+    found_cameras: dict[int, FirstCamera] = {}
+    unsolved = np.arange(len(xy))
+    shape = get_model(attempts[0][0])
     xy = in_model_units(xy, shape, image_size)
-    for name, wanted, start in tried:
-        X = points[left] if points.ndim == 3 else points
+    for name, free_names, start in attempts:
+        X = points[unsolved] if points.ndim == 3 else points
         batch = calibrate_batch(
             X,
-            xy[left],
+            xy[unsolved],
             image_size,
             model=name,
-            free=wanted,
+            free=free_names,
             start=start,
             threads=threads,
         )
-        found |= {int(i): FirstCamera(batch, row) for row, i in enumerate(left)}
-        left = left[~batch.solved]
-        if not len(left):
+        found_cameras |= {int(i): FirstCamera(batch, row) for row, i in enumerate(unsolved)}
+        unsolved = unsolved[~batch.solved]
+        if not len(unsolved):
             break
-    return [found[i] for i in range(len(xy))]
+    return [found_cameras[i] for i in range(len(xy))]
 
 
 def _attempts(
@@ -118,14 +118,14 @@ def _attempts(
         return [("opencv", SIMPLE, None), ("opencv", ("fx", "fy"), None)]
     # The principal distance is always sought. A second attempt without the higher coefficients:
     # what does not determine them may still determine a start.
-    held = tuple(n for n in model.principal_distance if n not in free)
-    attempts: list[Attempt] = [(model.name, (*held, *free), None)]
+    held_names = tuple(n for n in model.principal_distance if n not in free)
+    attempts: list[Attempt] = [(model.name, (*held_names, *free), None)]
     if model.name == "opencv":
-        attempts.append(("opencv", (*held, *(n for n in free if n in SIMPLE)), None))
+        attempts.append(("opencv", (*held_names, *(n for n in free if n in SIMPLE)), None))
     if model.name == "kannala-brandt":
-        known = [{"fx": f, "fy": f} for f in (max(size) / angle for angle in WIDE)]
-        attempts += [(model.name, free, start) for start in known]
-        attempts += [(model.name, ("fx", "fy", "cx", "cy"), start) for start in known]
+        focal_lengths = [{"fx": f, "fy": f} for f in (max(size) / angle for angle in WIDE)]
+        attempts += [(model.name, free, start) for start in focal_lengths]
+        attempts += [(model.name, ("fx", "fy", "cx", "cy"), start) for start in focal_lengths]
     return attempts
 
 
@@ -135,31 +135,33 @@ def _by_fit(model: CameraModel) -> bool:
 
 
 def parameters_of(
-    first: FirstCamera,
+    first_camera: FirstCamera,
     xy: Float[np.ndarray, "n 2"],
     image_size: tuple[float, float],
     model: CameraModel,
     free: Sequence[str],
     pixel_size: tuple[float, float] | None = None,
-    given: Mapping[str, float] | None = None,
+    given_values: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Start values of the parameters of a model; `xy`: all image points, pixels; `given`: values
-    known beforehand.
+    """Start values of the parameters of a model; `xy`: all image points, pixels; `given_values`:
+    values known beforehand.
 
     **Raises:** `NotSolvedError` where the model cannot be fitted."""
-    given = dict(given or {})
+    given_values = dict(given_values or {})
     if _by_fit(model):
-        return _fit(first, xy, image_size, model, free, pixel_size, given) | given
-    found = first.interior
+        return (
+            _fit(first_camera, xy, image_size, model, free, pixel_size, given_values) | given_values
+        )
+    interior = first_camera.interior
     if model.unit == "px":
-        return found | given
+        return interior | given_values
     width, height = pixel_size or (1.0, 1.0)
-    c = (found["fx"] * width + found["fy"] * height) / 2
-    centre = np.array([found["cx"], found["cy"]])
+    c = (interior["fx"] * width + interior["fy"] * height) / 2
+    centre = np.array([interior["cx"], interior["cy"]])
     x0, y0 = in_model_units(centre, model, image_size, (width, height)).tolist()
     # OpenCV adds k1·r² to the ideal point; corrections are applied to the measured one
     sign = -1 if model.own_formula == "to_ideal" else 1
-    parameters = {"c": c, "x0": x0, "y0": y0, "K1": sign * found["k1"] / c**2}
+    parameters = {"c": c, "x0": x0, "y0": y0, "K1": sign * interior["k1"] / c**2}
     parameters = {
         name: value
         for name, value in parameters.items()
@@ -169,43 +171,43 @@ def parameters_of(
         # The radial polynomial is zero at 100/F: in the corners of the image.
         diagonal = np.hypot(*(np.array(image_size) * (width, height)))
         parameters["format_factor"] = 200 / float(diagonal)
-    return parameters | given
+    return parameters | given_values
 
 
 def _fit(
-    first: FirstCamera,
+    first_camera: FirstCamera,
     xy: Float[np.ndarray, "n 2"],
     image_size: tuple[float, float],
     model: CameraModel,
     free: Sequence[str],
     pixel_size: tuple[float, float] | None,
-    given: dict[str, float],
+    given_values: dict[str, float],
 ) -> dict[str, float]:
     """Parameters of a model fitted to the images of the computed camera, over the measured area;
     for a model with priors, all parameters with a prior, over the whole image if possible."""
-    conventions = dict(given)
+    conventions = dict(given_values)
     if model.prior:
         # Held, whatever it is; near the true one, so that knots without points, which stay at 0,
         # are like their neighbours.
-        centre = {name: first.interior[name] for name in ("cx", "cy")}
+        centre = {name: first_camera.interior[name] for name in ("cx", "cy")}
         conventions = {n: v for n, v in centre.items() if n in model.parameters} | conventions
     if {*conventions} - {*model.principal_distance}:
         model = dataclasses.replace(model, defaults=dict(model.defaults) | conventions)
     core = () if model.prior else model.principal_distance
-    wanted = [n for n in model.parameters if n in (*core, *free) and n not in given]
+    fitted_names = [n for n in model.parameters if n in (*core, *free) and n not in given_values]
     areas = [(xy.min(0), xy.max(0))]
     # Over the measured area: beyond it the first camera is extrapolated, and a fit would follow
     # that. Models with priors (splines) first over the whole image, where every knot gets a value.
     for area in [None, *areas] if model.prior else areas:
         try:
             cost = convert_camera(
-                first.model,
-                first.interior,
+                first_camera.model,
+                first_camera.interior,
                 model,
                 image_size=image_size,
                 pixel_size=pixel_size,
                 area=area,
-                free=wanted,
+                free=fitted_names,
             )
         except ValueError as error:
             problem = error

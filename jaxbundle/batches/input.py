@@ -67,9 +67,9 @@ def single_list(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
         return X
     cameras, views, points, _ = xy.shape
     if X.shape in ((1, points, 3), (views, points, 3), (cameras, views, points, 3)):
-        first = X[..., :1, :, :]
-        if np.array_equal(X, np.broadcast_to(first, X.shape), equal_nan=True):
-            return first[..., 0, :, :]
+        first_view = X[..., :1, :, :]
+        if np.array_equal(X, np.broadcast_to(first_view, X.shape), equal_nan=True):
+            return first_view[..., 0, :, :]
         raise InputError(
             "object_points differ from view to view; give the points of all views as one list "
             "[points, 3], and by visible which of them a view shows"
@@ -100,9 +100,9 @@ def check_shapes(
         raise InputError(
             f"visible must have the shape {xy.shape[:3]} of image_points, but has {visible.shape}"
         )
-    for number, thing in zip(xy.shape, ("camera", "view", "point")):
+    for number, noun in zip(xy.shape, ("camera", "view", "point")):
         if not number:
-            raise InputError(f"image_points has no {thing}: its shape is {xy.shape}")
+            raise InputError(f"image_points has no {noun}: its shape is {xy.shape}")
     if visible.dtype.kind != "b" and not np.isin(np.asarray(visible), (0, 1)).all():
         raise InputError("visible must be true or false, or 1 or 0")
     if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
@@ -166,14 +166,14 @@ class Batch:
         xy = xy if xy.dtype in (np.float32, np.float64) else xy.astype(float)
         cameras = len(xy)
         free = free_parameters(model, free)
-        interior, known = _interior(model, free, start, size, cameras)
+        interior, has_focal_length = _interior(model, free, start, size, cameras)
         # NaN is a missing point; infinite numbers are a fault of the camera, and end in its status
-        there = ~np.any(np.isnan(X), axis=-1)
+        has_coordinates = ~np.any(np.isnan(X), axis=-1)
         # x and y apart: numpy's `any` over an axis of two takes ten times as long
-        missing = np.isnan(xy[..., 0]) | np.isnan(xy[..., 1])
-        visible = visible.astype(bool) & ~missing & there[..., None, :]
-        seen = np.any(visible, axis=1)
-        X = np.where(seen[..., None], X.astype(float), 0.0)
+        is_missing = np.isnan(xy[..., 0]) | np.isnan(xy[..., 1])
+        visible = visible.astype(bool) & ~is_missing & has_coordinates[..., None, :]
+        is_seen = np.any(visible, axis=1)
+        X = np.where(is_seen[..., None], X.astype(float), 0.0)
         if not visible.all():
             xy = np.where(visible[..., None], xy, 0.0)
         finite = _usable(X) & _usable(xy) & _usable(interior)
@@ -181,12 +181,12 @@ class Batch:
             X[~finite], xy = 0.0, np.where(finite[:, None, None, None], xy, 0.0)
         return cls(
             finite,
-            *_principal_axes(X, seen),
+            *_principal_axes(X, is_seen),
             xy=xy,
             visible=visible,
             interior=interior,
             free=tuple(model.parameters.index(name) for name in free),
-            known=known,
+            known=has_focal_length,
             image_size=size.astype(float),
         )
 
@@ -196,20 +196,24 @@ class Batch:
         points = self.xy.shape[2]
         # Few points: to whole vectors of 8 doubles, which cost nothing.
         points = bucket(points) if points > 128 else -(-points // 8) * 8
-        shown = self.visible.any(2) & self.finite[:, None]
-        widths = self._widths(shown.sum(1), points, settings.points_worth_compiling)
+        is_shown = self.visible.any(2) & self.finite[:, None]
+        widths = self._widths(is_shown.sum(1), points, settings.points_worth_compiling)
         size = settings.cameras_on_cpu
         if not on_cpu:
-            most = settings.points_on_accelerator / (max(widths, default=1) * points)
-            power = math.log2(max(most, 1))
+            max_views = settings.points_on_accelerator / (max(widths, default=1) * points)
+            power = math.log2(max(max_views, 1))
             size = 2 ** min(math.floor(power), math.ceil(math.log2(max(len(self), 1))))
         for flat in (True, False):
             for width in np.unique(widths):
                 cameras = np.flatnonzero((self.flat == flat) & (widths == width))
-                for first in range(0, len(cameras), size):
-                    some = cameras[first : first + size]
-                    views = np.argsort(~shown[some], axis=1, kind="stable")[:, :width]
-                    yield self._portion(some, np.sort(views), flat, size, (width, points))
+                for begin in range(0, len(cameras), size):
+                    cameras_of_portion = cameras[begin : begin + size]
+                    views = np.argsort(~is_shown[cameras_of_portion], axis=1, kind="stable")[
+                        :, :width
+                    ]
+                    yield self._portion(
+                        cameras_of_portion, np.sort(views), flat, size, (width, points)
+                    )
 
     def _widths(
         self, views: Int[np.ndarray, " cameras"], points: int, worth_compiling: int
@@ -236,18 +240,18 @@ class Batch:
         def wide(rows: np.ndarray, *axes: int) -> np.ndarray:
             if rows.shape[: len(axes)] == axes:
                 return rows
-            missing = [n - old for n, old in zip(axes, rows.shape)]
-            return np.pad(rows, [(0, n) for n in missing] + [(0, 0)] * (rows.ndim - len(axes)))
+            rows_missing = [n - old for n, old in zip(axes, rows.shape)]
+            return np.pad(rows, [(0, n) for n in rows_missing] + [(0, 0)] * (rows.ndim - len(axes)))
 
         # Neighbours are not copied: of 10 000 cameras the new memory costs more than the numbers.
         neighbours = cameras[-1] - cameras[0] == len(cameras) - 1
-        of = slice(cameras[0], cameras[-1] + 1) if neighbours else cameras
+        camera_rows = slice(cameras[0], cameras[-1] + 1) if neighbours else cameras
         in_order = np.array_equal(views, np.broadcast_to(np.arange(views.shape[1]), views.shape))
         of_views = lambda rows: (
-            rows[of, : views.shape[1]] if in_order else rows[cameras[:, None], views]
+            rows[camera_rows, : views.shape[1]] if in_order else rows[cameras[:, None], views]
         )
         visible = of_views(self.visible) & self.finite[cameras, None, None]
-        seen = Sightings(
+        sightings = Sightings(
             point=wide(self.point[cameras], size, shape[1]),
             xy=wide(of_views(self.xy), size, *shape),
             weight=wide(visible.astype(np.float32), size, *shape),
@@ -258,7 +262,7 @@ class Batch:
             cameras,
             views,
             flat,
-            seen,
+            sightings,
             interior,
             wide(self.axes[cameras], size),
             wide(self.middle[cameras], size),
@@ -351,11 +355,11 @@ def _interior(
                 f"start: camera model {model.name!r} has no parameter {name!r}; "
                 f"its parameters are {', '.join(model.parameters)}"
             )
-    given = [name for name in model.principal_distance if name in start]
-    missing = [name for name in model.principal_distance if name not in start]
-    held = [name for name in missing if name not in free]
-    if (given and missing) or held:
-        raise InputError(f"start: give {', '.join(missing)} as well")
+    names_given = [name for name in model.principal_distance if name in start]
+    missing_names = [name for name in model.principal_distance if name not in start]
+    held_names = [name for name in missing_names if name not in free]
+    if (names_given and missing_names) or held_names:
+        raise InputError(f"start: give {', '.join(missing_names)} as well")
     number = f"a number, or one for each of {cameras} cameras"
     columns = []
     for name in model.parameters:
@@ -365,22 +369,22 @@ def _interior(
         if name in model.principal_distance and (column <= 0).any():
             raise InputError(f"start: {name} must be positive")
         columns.append(np.broadcast_to(column.astype(float), (cameras,)))
-    return np.stack(columns, 1), bool(given)
+    return np.stack(columns, 1), bool(names_given)
 
 
 def _principal_axes(
-    X: Float[np.ndarray, "*cameras points 3"], seen: Bool[np.ndarray, "*cameras points"]
+    X: Float[np.ndarray, "*cameras points 3"], is_seen: Bool[np.ndarray, "*cameras points"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points [cameras, points, 3] about the mean of those seen, along their principal axes; the
     mean; the axes as rows [cameras, 3, 3]; is the object flat?"""
-    if len(X) > 1 and (seen == seen[0]).all() and (X == X[0]).all():
+    if len(X) > 1 and (is_seen == is_seen[0]).all() and (X == X[0]).all():
         a, b, c, d = (
-            np.broadcast_to(x, (len(X), *x.shape[1:])) for x in _principal_axes(X[:1], seen[:1])
+            np.broadcast_to(x, (len(X), *x.shape[1:])) for x in _principal_axes(X[:1], is_seen[:1])
         )
         return a, b, c, d
-    number = np.maximum(seen.sum(1), 1)[:, None]
+    number = np.maximum(is_seen.sum(1), 1)[:, None]
     middle = X.sum(1) / number
-    centred = np.where(seen[..., None], X - middle[:, None], 0.0)
+    centred = np.where(is_seen[..., None], X - middle[:, None], 0.0)
     values, vectors = np.linalg.eigh(np.einsum("cpi,cpj->cij", centred, centred))
     # The longest first, right-handed: a flat object lies in the plane Z = 0, as `start` needs it.
     axes = vectors[:, :, ::-1].swapaxes(1, 2)

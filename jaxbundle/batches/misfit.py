@@ -70,18 +70,18 @@ def misfits(
     settings: MisfitSettings = DEFAULTS,
 ) -> Bool[np.ndarray, " cameras"]:
     """Which solved cameras do not fit; `mean_length` of their residuals (pixels)."""
-    found = np.zeros(len(rms), bool)
+    is_misfit = np.zeros(len(rms), bool)
     # A few blunders raise √(mean of squares), hardly the mean: their ratio is a test of one camera
     # by itself, without knowing the noise.
     candidates = np.flatnonzero(solved & (rms > settings.negligible))
-    found[candidates] = rms[candidates] > settings.max_tail * NORMAL * mean_length[candidates]
+    is_misfit[candidates] = rms[candidates] > settings.max_tail * NORMAL * mean_length[candidates]
     factor = settings.min_ratio_of_few
     if solved.sum() >= settings.min_cameras:
         # In the logarithm, since an RMS is positive and its scatter proportional to it.
         log = np.log(np.maximum(rms[solved], settings.negligible))
-        spread = NORMAL_SIGMA_BY_MAD * np.median(np.abs(log - np.median(log)))
-        factor = np.exp(max(np.log(settings.min_ratio), settings.max_deviations * spread))
-    return found | (rms > factor * rms_beside(rms, solved, settings))
+        scatter = NORMAL_SIGMA_BY_MAD * np.median(np.abs(log - np.median(log)))
+        factor = np.exp(max(np.log(settings.min_ratio), settings.max_deviations * scatter))
+    return is_misfit | (rms > factor * rms_beside(rms, solved, settings))
 
 
 def rms_beside(
@@ -96,8 +96,8 @@ def rms_beside(
     if len(some) >= settings.min_cameras:
         beside[solved] = np.median(some)
     elif len(some) > 1:
-        least, second = np.sort(some)[:2]
-        beside[solved] = np.where(np.arange(len(some)) == some.argmin(), second, least)
+        smallest, second_smallest = np.sort(some)[:2]
+        beside[solved] = np.where(np.arange(len(some)) == some.argmin(), second_smallest, smallest)
     return beside
 
 
@@ -115,40 +115,42 @@ def far_outside(
     xy: Float[np.ndarray, "cameras views points 2"],
     visible: Bool[np.ndarray, "cameras views points"],
     size: Float[np.ndarray, "2"],
-    down: bool,
+    y_down: bool,
 ) -> Bool[np.ndarray, "cameras views points"]:
     """Which visible points are so far outside the image that they cannot be measurements; none for
     a camera with most points outside, since then the axes or the size are wrong."""
-    far = visible & _beyond(xy, size, down, DEFAULTS.far_outside)
-    most = far.sum((1, 2)) > DEFAULTS.max_outside * visible.sum((1, 2))
-    return far & ~most[:, None, None]
+    is_far = visible & _beyond(xy, size, y_down, DEFAULTS.far_outside)
+    has_most_outside = is_far.sum((1, 2)) > DEFAULTS.max_outside * visible.sum((1, 2))
+    return is_far & ~has_most_outside[:, None, None]
 
 
-def _corner(size: Float[np.ndarray, "2"], down: bool) -> Float[np.ndarray, "2"]:
+def _corner(size: Float[np.ndarray, "2"], y_down: bool) -> Float[np.ndarray, "2"]:
     """The smallest coordinates in an image."""
-    return np.full(2, -0.5) if down else -size / 2
+    return np.full(2, -0.5) if y_down else -size / 2
 
 
 def _beyond(
-    xy: Float[np.ndarray, "*points 2"], size: Float[np.ndarray, "2"], down: bool, margin: float
+    xy: Float[np.ndarray, "*points 2"], size: Float[np.ndarray, "2"], y_down: bool, margin: float
 ) -> Bool[np.ndarray, "*points"]:
     """Which points are outside the image by more than `margin` times its size."""
-    low = _corner(size, down) - margin * size
+    low = _corner(size, y_down) - margin * size
     high = low + (1 + 2 * margin) * size
     # x and y apart: numpy's `any` over an axis of two takes ten times as long
     x, y = xy[..., 0], xy[..., 1]
     return (x < low[0]) | (x > high[0]) | (y < low[1]) | (y > high[1])
 
 
-def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool) -> str:
+def axes_remark(
+    xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], y_down: bool
+) -> str:
     """A remark about suspicious axes of image points; if most of them are in the image, the number
     of points far outside, if any.
 
-    **Arguments:** `down`: y is counted downwards from the upper left pixel, else upwards from the
+    **Arguments:** `y_down`: y is counted downwards from the upper left pixel, else upwards from the
     middle.
     """
-    low = _corner(size, down)
-    part = _beyond(xy, size, down, 0).mean() if len(xy) else 0.0
+    low = _corner(size, y_down)
+    part = _beyond(xy, size, y_down, 0).mean() if len(xy) else 0.0
     if len(xy) and np.ptp(xy, axis=0).max() < DEFAULTS.min_extent * size.max():
         wide, high = np.ptp(xy, axis=0)
         return (
@@ -156,16 +158,18 @@ def axes_remark(xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"],
             f"{size[1]:g} pixels: are they in pixels, and is image_size right?"
         )
     if part <= DEFAULTS.max_outside:
-        far = int(_beyond(xy, size, down, DEFAULTS.far_outside).sum())
-        points = "image point is" if far == 1 else "image points are"
-        return f"{far} {points} far outside the image: data snooping removes them" * (far > 0)
+        number_far = int(_beyond(xy, size, y_down, DEFAULTS.far_outside).sum())
+        points = "image point is" if number_far == 1 else "image points are"
+        return f"{number_far} {points} far outside the image: data snooping removes them" * (
+            number_far > 0
+        )
     # Nine points in ten decide about a wrong axis: the others may be blunders.
-    if not down and ((xy > -0.5) & (xy < size)).all(1).mean() > 0.9:
+    if not y_down and ((xy > -0.5) & (xy < size)).all(1).mean() > 0.9:
         return (
             "the image points seem to be counted from a corner of the image: in this model (0, 0) "
             "is its middle, and y goes up"
         )
-    if not down:
+    if not y_down:
         return f"{100 * part:.0f} % of the image points are outside the image"
     for axis, name in enumerate("xy"):
         negated = (xy[:, axis] < low[axis]) & (xy[:, axis] > -size[axis] - 0.5)
@@ -190,8 +194,8 @@ def remarks(
         middle = rows["interior"][:, columns]
         good = good & ((middle > -0.5) & (middle < frame - 0.5)).all(1)
     remark = [""] * len(batch)
-    outside = (batch.visible & _beyond(batch.xy, frame, model.axes == "down", 0)).sum((1, 2))
-    part = outside / np.maximum(batch.visible.sum((1, 2)), 1)
+    number_outside = (batch.visible & _beyond(batch.xy, frame, model.axes == "down", 0)).sum((1, 2))
+    part = number_outside / np.maximum(batch.visible.sum((1, 2)), 1)
     for camera in np.flatnonzero(good & (part > DEFAULTS.max_outside_of_good)):
         remark[camera] = (
             f"{100 * part[camera]:.0f} % of the image points are outside the image of "
@@ -202,8 +206,8 @@ def remarks(
     vague = rows["undetermined"].any(1)
     for camera in np.flatnonzero(~good & batch.finite):
         xy = batch.xy[camera][batch.visible[camera]]
-        said = [axes_remark(xy, frame, model.axes == "down")]
+        remarks_of_camera = [axes_remark(xy, frame, model.axes == "down")]
         if vague[camera]:
-            said.append(rms_remark(rows["rms"][camera], beside[camera]))
-        remark[camera] = "; ".join(filter(None, said))
+            remarks_of_camera.append(rms_remark(rows["rms"][camera], beside[camera]))
+        remark[camera] = "; ".join(filter(None, remarks_of_camera))
     return np.array(remark)

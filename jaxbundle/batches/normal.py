@@ -62,79 +62,81 @@ class CameraUnknowns(eqx.Module):
 
 
 def normal_equations(
-    model: CameraModel, free: tuple[int, ...], seen: Sightings, at: CameraUnknowns
+    model: CameraModel, free: tuple[int, ...], sightings: Sightings, unknowns: CameraUnknowns
 ) -> Float[Array, "views n n"]:
     """The augmented normal matrix of every view [views, 6 + k + 1, 6 + k + 1].
 
     **Arguments:** `free`: the columns of the k free parameters.
     """
-    return gram(*design(model, free, seen, at))
+    return gram(*design(model, free, sightings, unknowns))
 
 
 def design(
-    model: CameraModel, free: tuple[int, ...], seen: Sightings, at: CameraUnknowns
+    model: CameraModel, free: tuple[int, ...], sightings: Sightings, unknowns: CameraUnknowns
 ) -> tuple[list[ByPoint], list[ByPoint]]:
     """The columns of [Jₑ Jᵢ v], each [views, points]: the rows of x, and those of y."""
-    M = jax.vmap(matrix_from_quaternion)(at.rotation)
+    M = jax.vmap(matrix_from_quaternion)(unknowns.rotation)
     of_view = lambda column: column[:, None]
     # Invisible points are put at the centre of the object, whose image always exists.
-    X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
+    X = [jnp.where(sightings.weight > 0, sightings.point[:, i], 0.0) for i in range(3)]
     Y = [sum(of_view(M[:, i, j]) * X[j] for j in range(3)) for i in range(3)]
-    t = [of_view(at.shift[:, i]) for i in range(3)]
-    xy = (seen.xy[..., 0], seen.xy[..., 1])
+    t = [of_view(unknowns.shift[:, i]) for i in range(3)]
+    xy = (sightings.xy[..., 0], sightings.xy[..., 1])
 
     def weighted_residual(change: tuple[Sequence[ByPoint], ...]) -> tuple[ByPoint, ByPoint]:
         d_shift, (a, b, c), d_interior = change
         turn = (b * Y[2] - c * Y[1], c * Y[0] - a * Y[2], a * Y[1] - b * Y[0])
         ray = tuple(Y[i] + turn[i] + t[i] + d_shift[i] for i in range(3))
-        interior = list(at.interior)
+        interior = list(unknowns.interior)
         for column, d in zip(free, d_interior):
             interior[column] = interior[column] + d
         vx, vy = cameras.residual(model, "measured", tuple(interior), ray, xy)
-        return seen.weight * vx, seen.weight * vy
+        return sightings.weight * vx, sightings.weight * vy
 
     # Every point has its own unknowns here, so that one pull for x and one for y, of all points at
     # once, give all columns: two passes whatever the number of parameters.
-    nil = jnp.zeros_like(seen.weight)
-    one = jnp.ones_like(nil)
-    still = ((nil,) * 3, (nil,) * 3, (nil,) * len(free))
-    (vx, vy), pull = jax.vjp(weighted_residual, still)
+    nil = jnp.zeros_like(sightings.weight)
+    ones = jnp.ones_like(nil)
+    zero_change = ((nil,) * 3, (nil,) * 3, (nil,) * len(free))
+    (vx, vy), pull = jax.vjp(weighted_residual, zero_change)
     flat = lambda rows: [column for group in rows for column in group]
-    return [*flat(pull((one, nil))[0]), vx], [*flat(pull((nil, one))[0]), vy]
+    return [*flat(pull((ones, nil))[0]), vx], [*flat(pull((nil, ones))[0]), vy]
 
 
-def residual_lengths(model: CameraModel, seen: Sightings, at: CameraUnknowns) -> ByPoint:
+def residual_lengths(model: CameraModel, sightings: Sightings, unknowns: CameraUnknowns) -> ByPoint:
     """√(vx² + vy²) of all points, 0 if invisible."""
-    M = jax.vmap(matrix_from_quaternion)(at.rotation)
-    X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
+    M = jax.vmap(matrix_from_quaternion)(unknowns.rotation)
+    X = [jnp.where(sightings.weight > 0, sightings.point[:, i], 0.0) for i in range(3)]
     r, s, q = (
-        sum(M[:, i, j, None] * X[j] for j in range(3)) + at.shift[:, i, None] for i in range(3)
+        sum(M[:, i, j, None] * X[j] for j in range(3)) + unknowns.shift[:, i, None]
+        for i in range(3)
     )
-    xy = (seen.xy[..., 0], seen.xy[..., 1])
-    vx, vy = cameras.residual(model, "measured", tuple(at.interior), (r, s, q), xy)
-    return jnp.asarray(seen.weight) * jnp.sqrt(vx * vx + vy * vy)
+    xy = (sightings.xy[..., 0], sightings.xy[..., 1])
+    vx, vy = cameras.residual(model, "measured", tuple(unknowns.interior), (r, s, q), xy)
+    return jnp.asarray(sightings.weight) * jnp.sqrt(vx * vx + vy * vy)
 
 
 def effects_of_object_points(
-    model: CameraModel, seen: Sightings, at: CameraUnknowns
+    model: CameraModel, sightings: Sightings, unknowns: CameraUnknowns
 ) -> tuple[Float[Array, "2 views points"], Float[Array, "3 2 views points"]]:
     """v of all points and ∂v/∂X by their object points, 0 if invisible: forward, 0.05 ms (backward,
     as in `design`, 0.09 ms)."""
-    M = jax.vmap(matrix_from_quaternion)(at.rotation)
-    xy = (seen.xy[..., 0], seen.xy[..., 1])
-    weight = jnp.asarray(seen.weight)
-    X = [jnp.where(weight > 0, seen.point[:, i], 0.0) for i in range(3)]
+    M = jax.vmap(matrix_from_quaternion)(unknowns.rotation)
+    xy = (sightings.xy[..., 0], sightings.xy[..., 1])
+    weight = jnp.asarray(sightings.weight)
+    X = [jnp.where(weight > 0, sightings.point[:, i], 0.0) for i in range(3)]
 
     def weighted_residual(X: Sequence[ByPoint]) -> tuple[ByPoint, ByPoint]:
         r, s, q = (
-            sum(M[:, i, j, None] * X[j] for j in range(3)) + at.shift[:, i, None] for i in range(3)
+            sum(M[:, i, j, None] * X[j] for j in range(3)) + unknowns.shift[:, i, None]
+            for i in range(3)
         )
-        vx, vy = cameras.residual(model, "measured", tuple(at.interior), (r, s, q), xy)
+        vx, vy = cameras.residual(model, "measured", tuple(unknowns.interior), (r, s, q), xy)
         return weight * vx, weight * vy
 
-    one, none = jnp.ones_like(weight), jnp.zeros_like(weight)
-    along = lambda axis: [one if i == axis else none for i in range(3)]
-    pushed = [jax.jvp(weighted_residual, (X,), (along(axis),)) for axis in range(3)]
+    ones, zeros = jnp.ones_like(weight), jnp.zeros_like(weight)
+    direction_of = lambda axis: [ones if i == axis else zeros for i in range(3)]
+    pushed = [jax.jvp(weighted_residual, (X,), (direction_of(axis),)) for axis in range(3)]
     return jnp.stack(pushed[0][0]), jnp.stack([jnp.stack(change) for _, change in pushed])
 
 
@@ -217,22 +219,26 @@ def cofactors(
     columns = [jnp.broadcast_to(row, (len(factor.scale), POSE)) for row in jnp.eye(POSE)]
     wide = [[element[:, None] for element in row] for row in factor.pose]
     # Qₑₑ = Nₑₑ⁻¹ + Nₑₑ⁻¹·Nₑᵢ·Qᵢᵢ·Nᵢₑ·Nₑₑ⁻¹
-    alone = backward(wide, forward(wide, columns))
-    through = backward(wide, [row[:, :k] for row in factor.eliminated])
-    alone, through = (factor.scale[:, :, None] * jnp.stack(x, 1) for x in (alone, through))
-    pose = alone * factor.scale[:, None, :] + through @ interior @ through.swapaxes(1, 2)
+    pose_alone = backward(wide, forward(wide, columns))
+    pose_through_interior = backward(wide, [row[:, :k] for row in factor.eliminated])
+    pose_alone, pose_through_interior = (
+        factor.scale[:, :, None] * jnp.stack(x, 1) for x in (pose_alone, pose_through_interior)
+    )
+    pose = pose_alone * factor.scale[
+        :, None, :
+    ] + pose_through_interior @ interior @ pose_through_interior.swapaxes(1, 2)
     return interior, pose, 1 / jnp.max(jnp.diagonal(inverse))
 
 
 def retract(
     free: tuple[int, ...],
-    at: CameraUnknowns,
+    unknowns: CameraUnknowns,
     d_pose: Float[Array, "views 6"],
     d_interior: Float[Array, " k"],
 ) -> CameraUnknowns:
     """The unknowns after a change; every view rotates about the centre of the object."""
     return CameraUnknowns(
-        interior=jnp.asarray(at.interior).at[jnp.array(free)].add(d_interior),
-        rotation=jax.vmap(retract_quaternion)(at.rotation, d_pose[:, 3:]),
-        shift=at.shift + d_pose[:, :3],
+        interior=jnp.asarray(unknowns.interior).at[jnp.array(free)].add(d_interior),
+        rotation=jax.vmap(retract_quaternion)(unknowns.rotation, d_pose[:, 3:]),
+        shift=unknowns.shift + d_pose[:, :3],
     )

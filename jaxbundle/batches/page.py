@@ -37,51 +37,52 @@ def compose_batch(
     """The page of the results of `run_batch`, as their lines are read (`result_rows`): HTML, in
     pieces. `against`: columns to correlate with (`Population.correlations`); `also`: findings and
     sections of a command."""
-    found = rows if isinstance(rows, Population) else Population(rows)
-    return write(_describe(found, origin, against, also))
+    population = rows if isinstance(rows, Population) else Population(rows)
+    return write(_describe(population, origin, against, also))
 
 
 def _describe(
-    found: Population, origin: Origin, against: Mapping[str, np.ndarray], also: Addition
+    population: Population, origin: Origin, against: Mapping[str, np.ndarray], addition: Addition
 ) -> Page:
     sections = [
-        *also.sections,
-        *_rms(found),
-        *_parameters(found),
-        *_correlations(found, against),
-        *_outlying(found),
+        *addition.sections,
+        *_rms(population),
+        *_parameters(population),
+        *_correlations(population, against),
+        *_outlying(population),
     ]
-    counts = Counter(found.status.tolist()).most_common()
-    states = [(name, n, fixed(100 * n / len(found), 1)) for name, n in counts]
-    shown = "<h3>Status</h3>\n", grid(("status", "number", "%"), states)
-    first = give_verdict([*also.findings, *_judge(found)], (), *shown)
-    title = f"{count(len(found), 'input')}: batch"
-    listed = Listing("Results", _columns(found, against), "", "One row a camera or network.")
-    return Page(title, [first, *sections], origin, tables={"results": listed})
+    counts = Counter(population.status.tolist()).most_common()
+    states = [(name, n, fixed(100 * n / len(population), 1)) for name, n in counts]
+    status_table = "<h3>Status</h3>\n", grid(("status", "number", "%"), states)
+    verdict_section = give_verdict([*addition.findings, *_judge(population)], (), *status_table)
+    title = f"{count(len(population), 'input')}: batch"
+    listing = Listing("Results", _columns(population, against), "", "One row a camera or network.")
+    return Page(title, [verdict_section, *sections], origin, tables={"results": listing})
 
 
-def _judge(found: Population) -> list[Finding]:
-    total, solved, fit = len(found), int(found.solved.sum()), int(found.fit.sum())
+def _judge(population: Population) -> list[Finding]:
+    total, solved, fit = len(population), int(population.solved.sum()), int(population.fit.sum())
     state = BAD if not solved else GOOD if solved == total else DOUBTFUL
     findings = [Finding("Results", state, f"{solved} of {count(total, 'input')} have values")]
     words = f"weak or misfit: {solved - fit} of these {solved}"
     findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
-    limit = found.settings.outlier_limit
-    far = int((np.nan_to_num(found.farthest) > limit).sum())
-    if np.isfinite(found.farthest).any():
+    limit = population.settings.outlier_limit
+    number_far = int((np.nan_to_num(population.farthest) > limit).sum())
+    if np.isfinite(population.farthest).any():
         words = (
-            f"{far} with a parameter more than {limit:g} robust standard deviations from the median"
+            f"{number_far} with a parameter more than {limit:g} robust standard deviations from "
+            "the median"
         )
-        findings.append(Finding("Population", DOUBTFUL if far else GOOD, words))
+        findings.append(Finding("Population", DOUBTFUL if number_far else GOOD, words))
     return findings
 
 
-def _rms(found: Population) -> list[Section]:
+def _rms(population: Population) -> list[Section]:
     """The histogram of the RMS of cameras, or of σ0 for networks only."""
     name, label = ("rms", "RMS of an image point [px]")
-    if not np.isfinite(found.numbers["rms"]).any():
+    if not np.isfinite(population.numbers["rms"]).any():
         name, label = "sigma0", "σ0"
-    values = found.numbers[name]
+    values = population.numbers[name]
     values = values[np.isfinite(values)]
     if not len(values):
         return []
@@ -89,26 +90,31 @@ def _rms(found: Population) -> list[Section]:
     # From 0, so that heights of two batches compare, and without the tail of a few misfits.
     top = max(min(3 * middle, float(values.max())), 1e-12)
     edges = np.linspace(0, top, 25)
-    above = (values > top).any()
-    edges = np.append(edges, np.inf) if above else edges
+    has_above = (values > top).any()
+    edges = np.append(edges, np.inf) if has_above else edges
     counted = np.histogram(values, edges)[0]
     caption = (
         f"{len(values)} results with values; median {significant(middle)}, largest "
-        f"{significant(float(values.max()))}" + ("; the last class is open" if above else "")
+        f"{significant(float(values.max()))}" + ("; the last class is open" if has_above else "")
     )
     drawing = figure(draw_histogram(edges, counted, label, "number of inputs"), caption)
     return [Section("rms", f"Distribution of {label.split(' [')[0]}", drawing, "Distribution")]
 
 
-def _parameters(found: Population) -> list[Section]:
+def _parameters(population: Population) -> list[Section]:
     rows = []
-    for name, values in found.values.items():
-        middle, deviation = found.spread(values)
-        sigma = found.spread(found.sigma[name])[0]
-        there = values[found.fit & np.isfinite(values)]
-        if len(there):
-            ends = (significant(x, digits_of(x, deviation)) for x in (there.min(), there.max()))
-            rows.append((name, len(there), *estimate(middle, deviation), significant(sigma), *ends))
+    for name, values in population.values.items():
+        middle, deviation = population.spread(values)
+        sigma = population.spread(population.sigma[name])[0]
+        finite_values = values[population.fit & np.isfinite(values)]
+        if len(finite_values):
+            ends = (
+                significant(x, digits_of(x, deviation))
+                for x in (finite_values.min(), finite_values.max())
+            )
+            rows.append(
+                (name, len(finite_values), *estimate(middle, deviation), significant(sigma), *ends)
+            )
     if not rows:
         return []
     note = paragraph(
@@ -117,41 +123,41 @@ def _parameters(found: Population) -> list[Section]:
         "measurements."
     )
     header = ("parameter", "cameras", "median", "robust σ", "median σ", "least", "greatest")
-    shown = grid(header, rows) + note + "".join(_histograms(found))
-    return [Section("population", "Parameters of the population", shown, "Population")]
+    content = grid(header, rows) + note + "".join(_histograms(population))
+    return [Section("population", "Parameters of the population", content, "Population")]
 
 
-def _histograms(found: Population) -> Iterator[str]:
-    for name, values in found.values.items():
-        edges, counted = found.histogram(values)
-        enough = counted.sum() >= found.settings.min_cameras
-        if enough and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
+def _histograms(population: Population) -> Iterator[str]:
+    for name, values in population.values.items():
+        edges, counted = population.histogram(values)
+        has_enough = counted.sum() >= population.settings.min_cameras
+        if has_enough and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
             yield figure(
                 draw_histogram(edges, counted, name, "number of cameras"),
                 f"{name} of {counted.sum()} converged cameras",
             )
 
 
-def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[Section]:
+def _correlations(population: Population, against: Mapping[str, np.ndarray]) -> list[Section]:
     """Correlations of parameters."""
-    told = found.correlations(against)
-    if not told:
+    correlations = population.correlations(against)
+    if not correlations:
         return []
-    level = found.settings.level / len(told)
+    level = population.settings.level / len(correlations)
     rows = [
         (
-            f"{one.parameter} with {one.column}",
-            one.cameras,
-            fixed(one.rank_correlation, 3),
-            significant(one.probability, 2),
-            "yes" if one.probability < level else "no",
-            significant(one.change),
+            f"{correlation.parameter} with {correlation.column}",
+            correlation.cameras,
+            fixed(correlation.rank_correlation, 3),
+            significant(correlation.probability, 2),
+            "yes" if correlation.probability < level else "no",
+            significant(correlation.change),
         )
-        for one in told
+        for correlation in correlations
     ]
     note = paragraph(
         "Rank correlation (Spearman) over the converged cameras, and the probability of one as "
-        f"large by chance; significant at {100 * found.settings.level:g} % for all of these "
+        f"large by chance; significant at {100 * population.settings.level:g} % for all of these "
         "together. Change: of the median, from the lower half of the column to the upper."
     )
     header = ("", "cameras", "correlation", "probability", "significant", "change")
@@ -165,17 +171,17 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
     ]
 
 
-def _outlying(found: Population) -> list[Section]:
+def _outlying(population: Population) -> list[Section]:
     """Inputs that need attention: those without a result first, then misfits, then the farthest."""
-    said = found.outlying()
-    if not said:
+    reasons = population.outlying()
+    if not reasons:
         return []
     rows = [
-        (found.keys[i], significant(found.numbers["rms"][i], 4), words)
-        for i, words in said[:30]  # a screen or two; the table has all
+        (population.keys[i], significant(population.numbers["rms"][i], 4), words)
+        for i, words in reasons[:30]  # a screen or two; the table has all
     ]
-    more = len(said) - len(rows)
-    note = paragraph(f"and {more} more: sort the table.") if more else ""
+    number_of_others = len(reasons) - len(rows)
+    note = paragraph(f"and {number_of_others} more: sort the table.") if number_of_others else ""
     return [
         Section(
             "outlying",
@@ -186,22 +192,25 @@ def _outlying(found: Population) -> list[Section]:
     ]
 
 
-def _columns(found: Population, against: Mapping[str, np.ndarray]) -> dict[str, Column]:
+def _columns(population: Population, against: Mapping[str, np.ndarray]) -> dict[str, Column]:
     places = {"rms": "RMS [px]", "sigma0": "σ0"}
-    columns = {"id": Column(found.keys, "input"), "status": Column(found.status, "status")}
+    columns = {
+        "id": Column(population.keys, "input"),
+        "status": Column(population.status, "status"),
+    }
     columns |= {
         name: Column(values, places.get(name, name), -4)
-        for name, values in found.numbers.items()
+        for name, values in population.numbers.items()
         if np.isfinite(values).any()
     }
-    for name, values in found.values.items():
+    for name, values in population.values.items():
         columns |= {
-            name: estimates(values, found.sigma[name], name),
-            f"sigma_{name}": Column(found.sigma[name], f"σ {name}"),
+            name: estimates(values, population.sigma[name], name),
+            f"sigma_{name}": Column(population.sigma[name], f"σ {name}"),
         }
-    if np.isfinite(found.farthest).any():
-        columns["farthest"] = Column(found.farthest, "largest deviation [robust σ]", 1)
+    if np.isfinite(population.farthest).any():
+        columns["farthest"] = Column(population.farthest, "largest deviation [robust σ]", 1)
     columns |= {
         f"with {n}": Column(values, n, -DIGITS_WITHOUT_SIGMA, True) for n, values in against.items()
     }
-    return columns | {"remark": Column(found.remark, "remark")}
+    return columns | {"remark": Column(population.remark, "remark")}

@@ -50,7 +50,7 @@ def is_photograph_folder(path: str | Path) -> bool:
 def has_photographs(path: str | Path) -> bool:
     """Whether a folder holds photographs itself."""
     try:
-        return any(one.suffix.lower() in SUFFIXES for one in Path(path).iterdir())
+        return any(file.suffix.lower() in SUFFIXES for file in Path(path).iterdir())
     except OSError:
         return False
 
@@ -58,7 +58,9 @@ def has_photographs(path: str | Path) -> bool:
 def camera_folders(path: str | Path) -> list[Path]:
     """The folders of photographs in a folder, by name."""
     try:
-        return sorted(one for one in Path(path).iterdir() if one.is_dir() and has_photographs(one))
+        return sorted(
+            entry for entry in Path(path).iterdir() if entry.is_dir() and has_photographs(entry)
+        )
     except OSError:
         return []
 
@@ -78,28 +80,32 @@ class PhotographFolders:
         return of_words(f"{name} {self.kept.content(path)}" for name, path in files.items())
 
     def measure(
-        self, chosen: Sequence[int], tell: Callable[[float], None] = lambda _: None
+        self, folders: Sequence[int], tell: Callable[[float], None] = lambda _: None
     ) -> dict[int, BoardViews | str]:
         """The views of some of the folders, or why there are none.
 
         `tell(part)`: the fraction of the photographs searched."""
-        files = {folder: self._files(folder) for folder in chosen}
+        files = {folder: self._files(folder) for folder in folders}
         # By content, not by name: a photograph copied to two folders is searched once.
-        contents = {path: self.kept.content(path) for of in files.values() for path in of.values()}
+        contents = {
+            path: self.kept.content(path)
+            for files_of_folder in files.values()
+            for path in files_of_folder.values()
+        }
         tasks = {
             content: (path, self.board)
             for path, content in contents.items()
             if content and self.kept.look(content, self.board) is None
         }
         died: dict[str, NotSearched] = {}
-        for done, (task, look) in enumerate(self.workers.run(tasks.values()), 1):
+        for number_done, (task, look) in enumerate(self.workers.run(tasks.values()), 1):
             content = contents[task[0]]
             if isinstance(look, Failed):
                 died[content] = NotSearched(look.why)  # not kept: another run may have more memory
             else:
                 self.kept.keep(content, self.board, look)
-            tell(done / len(tasks))
-        return {folder: self._views(folder, files[folder], contents, died) for folder in chosen}
+            tell(number_done / len(tasks))
+        return {folder: self._views(folder, files[folder], contents, died) for folder in folders}
 
     def _views(
         self,
@@ -111,19 +117,19 @@ class PhotographFolders:
         if not files:
             return _why_empty(self.folders[folder])
         looks: dict[str, Look] = {}
-        first: dict[str, str] = {}
+        first_of_content: dict[str, str] = {}
         for name, path in files.items():
             content = contents[path]
             looks[name] = (
                 "cannot be read"
                 if not content
-                else f"is the same file as {first[content]}"
-                if content in first
+                else f"is the same file as {first_of_content[content]}"
+                if content in first_of_content
                 else died.get(content) or self.kept.look(content, self.board) or "was not searched"
             )
-            first.setdefault(content, name)
+            first_of_content.setdefault(content, name)
         try:
-            return collect_views(files, looks, self.board, hints=not {*died} & {*first})
+            return collect_views(files, looks, self.board, hints=not {*died} & {*first_of_content})
         except InputError as error:
             return str(error)
 
@@ -135,11 +141,12 @@ class PhotographFolders:
 
 
 def _why_empty(folder: str | Path) -> str:
-    inside = [one.name for one in camera_folders(folder)]
-    if not inside:
+    folders_inside = [entry.name for entry in camera_folders(folder)]
+    if not folders_inside:
         return "no photographs in this folder"
     return (
-        f"no photographs in this folder, but in {list_some(inside, 3, str)} in it: give --rig "
+        f"no photographs in this folder, but in {list_some(folders_inside, 3, str)} in it: give "
+        "--rig "
         "for cameras on one mounting, or these folders"
     )
 
@@ -150,11 +157,15 @@ def calibrate_views(
     """Calibrate cameras from views of a board, those of one image size together: of each camera its
     number, the batch it was calibrated in, and its place there; `options` of `calibrate_batch`."""
     model = pixel_model(options["model"])
-    for size in dict.fromkeys(one.image_size for one in views.values()):
-        numbers = [number for number, one in views.items() if one.image_size == size]
-        most = max(len(views[number]) for number in numbers)
+    for size in dict.fromkeys(views_of_camera.image_size for views_of_camera in views.values()):
+        numbers = [
+            number
+            for number, views_of_camera in views.items()
+            if views_of_camera.image_size == size
+        ]
+        max_views = max(len(views[number]) for number in numbers)
         board = views[numbers[0]].board
-        xy = np.full((len(numbers), most, len(board.ids), 2), np.nan)
+        xy = np.full((len(numbers), max_views, len(board.ids), 2), np.nan)
         for place, number in enumerate(numbers):
             xy[place, : len(views[number])] = in_model_units(views[number].xy, model, size)
         batch = calibrate_batch(board.points, xy, size, visible=~np.isnan(xy[..., 0]), **options)
@@ -169,9 +180,9 @@ def of_photographs(views: BoardViews, brief: bool) -> dict:
     return row | of_unused(dict(views.failed))
 
 
-def of_unused(failed: Mapping[str, str]) -> dict[str, Any]:
+def of_unused(unused: Mapping[str, str]) -> dict[str, Any]:
     """The entries of a line about photographs that were not used, with the reasons."""
-    unsearched = [name for name, why in failed.items() if isinstance(why, NotSearched)]
-    return ({"photographs_not_used": dict(failed)} if failed else {}) | (
+    unsearched = [name for name, why in unused.items() if isinstance(why, NotSearched)]
+    return ({"photographs_not_used": dict(unused)} if unused else {}) | (
         {NOT_SEARCHED: unsearched} if unsearched else {}
     )

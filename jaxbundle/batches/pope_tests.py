@@ -28,27 +28,27 @@ from jaxbundle.cameras import CameraModel
 def point_tests(
     model: CameraModel,
     free: tuple[int, ...],
-    seen: Sightings,
-    used: ByPoint,
-    at: CameraUnknowns,
+    sightings: Sightings,
+    is_used: ByPoint,
+    unknowns: CameraUnknowns,
 ) -> ByPoint:
     """Test values of all points seen [views, points], in pixels; NaN where there is none.
 
-    **Arguments:** `seen`: the points of the included views; `used` [views, points]: 1 for
-    those the camera `at` was adjusted from, 0 for those that were removed.
+    **Arguments:** `sightings`: the points of the included views; `is_used` [views, points]: 1 for
+    those the camera `unknowns` was adjusted from, 0 for those that were removed.
     """
-    columns_x, columns_y = design(model, free, seen, at)
-    weighted = [[used * column for column in columns] for columns in (columns_x, columns_y)]
-    factor = factorise(gram(*weighted), seen.views, 0.0)
+    columns_x, columns_y = design(model, free, sightings, unknowns)
+    weighted = [[is_used * column for column in columns] for columns in (columns_x, columns_y)]
+    factor = factorise(gram(*weighted), sightings.views, 0.0)
 
     def test(columns: list[ByPoint]) -> ByPoint:
         h = _leverage(factor, columns[:-1])
-        redundancy = jnp.where(used > 0, 1 - h, 1 + h)
+        redundancy = jnp.where(is_used > 0, 1 - h, 1 + h)
         # A point of less redundancy is controlled by no other: far above rounding, far below any
         # redundancy number that serves a test.
-        known = (seen.weight > 0) & (redundancy > 1e-6)
-        value = jnp.abs(columns[-1]) / jnp.sqrt(jnp.where(known, redundancy, 1.0))
-        return jnp.where(known, value, jnp.nan)
+        is_known = (sightings.weight > 0) & (redundancy > 1e-6)
+        value = jnp.abs(columns[-1]) / jnp.sqrt(jnp.where(is_known, redundancy, 1.0))
+        return jnp.where(is_known, value, jnp.nan)
 
     return jnp.fmax(test(columns_x), test(columns_y))
 
@@ -59,11 +59,11 @@ def _leverage(factor: CameraFactor, row: list[ByPoint]) -> ByPoint:
     L = [wide(elements) for elements in factor.pose]
     scaled = [s * a for s, a in zip(wide(factor.scale.T), row[:POSE])]
     of_pose = forward(L, scaled)
-    rest = [
+    interior_rows = [
         a - sum(o * e[:, i, None] for o, e in zip(of_pose, factor.eliminated))
         for i, a in enumerate(row[POSE:])
     ]
-    rest = jnp.stack([s * a for s, a in zip(factor.interior_scale, rest)])
-    flat = rest.reshape(len(rest), -1)
+    interior_rows = jnp.stack([s * a for s, a in zip(factor.interior_scale, interior_rows)])
+    flat = interior_rows.reshape(len(interior_rows), -1)
     through = jax.scipy.linalg.solve_triangular(factor.interior, flat, lower=True)
-    return sum(o * o for o in of_pose) + (through**2).sum(0).reshape(rest.shape[1:])
+    return sum(o * o for o in of_pose) + (through**2).sum(0).reshape(interior_rows.shape[1:])

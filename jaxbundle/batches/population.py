@@ -72,14 +72,14 @@ class Population:
 
     def __init__(self, rows: Iterable[Mapping], settings: PopulationSettings | None = None):
         self.settings = settings or PopulationSettings()
-        kept = [_row(row) for row in rows]
-        words = lambda name: np.array([str(row.get(name, "")) for row in kept], dtype=object)
+        kept_rows = [_row(row) for row in rows]
+        words = lambda name: np.array([str(row.get(name, "")) for row in kept_rows], dtype=object)
         self.keys, self.status, self.remark = (words(n) for n in ("key", "status", "remark"))
-        self.numbers = {name: numbers(row.get(name) for row in kept) for name in NUMBERS}
-        self.models = {model for row in kept for model in row["models"]}
-        names = dict.fromkeys(name for row in kept for name in row["parameters"])
-        column = lambda name, what: numbers(
-            row["parameters"].get(name, {}).get(what) for row in kept
+        self.numbers = {name: numbers(row.get(name) for row in kept_rows) for name in NUMBERS}
+        self.models = {model for row in kept_rows for model in row["models"]}
+        names = dict.fromkeys(name for row in kept_rows for name in row["parameters"])
+        column = lambda name, quantity: numbers(
+            row["parameters"].get(name, {}).get(quantity) for row in kept_rows
         )
         self.values = {name: column(name, "value") for name in names}
         self.sigma = {name: column(name, "sigma") for name in names}
@@ -89,9 +89,9 @@ class Population:
         }
         # Views that determine nothing: weak without values.
         self._void = np.array(
-            [row.get("status") == STATUS[WEAK] and not row["parameters"] for row in kept], bool
+            [row.get("status") == STATUS[WEAK] and not row["parameters"] for row in kept_rows], bool
         )
-        self.rms_apart = self._apart(self.numbers["rms"], np.zeros(len(kept)))
+        self.rms_apart = self._apart(self.numbers["rms"], np.zeros(len(kept_rows)))
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -108,11 +108,11 @@ class Population:
 
     def spread(self, values: np.ndarray) -> tuple[float, float]:
         """Median and robust standard deviation over the population."""
-        found = values[self.fit & np.isfinite(values)]
-        if not len(found):
+        known_values = values[self.fit & np.isfinite(values)]
+        if not len(known_values):
             return np.nan, np.nan
-        middle = float(np.median(found))
-        return middle, NORMAL_SIGMA_BY_MAD * float(np.median(np.abs(found - middle)))
+        middle = float(np.median(known_values))
+        return middle, NORMAL_SIGMA_BY_MAD * float(np.median(np.abs(known_values - middle)))
 
     def _apart(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         middle, deviation = self.spread(values)
@@ -129,35 +129,35 @@ class Population:
         """The largest deviation of a parameter from the median, by row; NaN without any."""
         if not self.apart:
             return np.full(len(self), np.nan)
-        found = np.array(list(self.apart.values()))
-        largest = np.nan_to_num(found, nan=-1.0).max(0)
+        deviations = np.array(list(self.apart.values()))
+        largest = np.nan_to_num(deviations, nan=-1.0).max(0)
         return np.where(largest < 0, np.nan, largest)
 
     def why_outlying(self, i: int) -> str:
         """Status, remark and outlying parameters, in words; empty: not outlying."""
-        said = [] if self.fit[i] else [self.status[i]]
-        said += [self.remark[i]] if self.remark[i] else []
-        said += [
-            f"{name} {significant(far[i], 2)} robust σ from the median"
-            for name, far in self.apart.items()
-            if far[i] > self.settings.outlier_limit
+        reasons = [] if self.fit[i] else [self.status[i]]
+        reasons += [self.remark[i]] if self.remark[i] else []
+        reasons += [
+            f"{name} {significant(deviation[i], 2)} robust σ from the median"
+            for name, deviation in self.apart.items()
+            if deviation[i] > self.settings.outlier_limit
         ]
         if self.fit[i] and self.rms_apart[i] > self.settings.outlier_limit:
-            said.append(f"RMS {significant(self.rms_apart[i], 2)} robust σ above the median")
-        return "; ".join(said)
+            reasons.append(f"RMS {significant(self.rms_apart[i], 2)} robust σ above the median")
+        return "; ".join(reasons)
 
     def outlying(self) -> list[tuple[int, str]]:
         """Rows that need attention, with the reason: without a result first, then weak ones and
         misfits, then the farthest."""
-        said = [(i, self.why_outlying(i)) for i in range(len(self))]
-        far, rms = np.nan_to_num(self.farthest), np.nan_to_num(self.numbers["rms"])
-        said = [(i, words) for i, words in said if words]
+        reasons = [(i, self.why_outlying(i)) for i in range(len(self))]
+        farthest, rms = np.nan_to_num(self.farthest), np.nan_to_num(self.numbers["rms"])
+        reasons = [(i, words) for i, words in reasons if words]
         return sorted(
-            said,
+            reasons,
             key=lambda item: (
                 bool(self.solved[item[0]]),
                 bool(self.fit[item[0]]),
-                -far[item[0]],
+                -farthest[item[0]],
                 -rms[item[0]],
             ),
         )
@@ -165,56 +165,61 @@ class Population:
     def histogram(self, values: np.ndarray) -> tuple[Float[np.ndarray, " edges"], np.ndarray]:
         """Edges and counts of classes over the population, the outer ones open if values lie
         beyond."""
-        found = values[self.fit & np.isfinite(values)]
-        if not len(found):
+        known_values = values[self.fit & np.isfinite(values)]
+        if not len(known_values):
             return np.zeros(0), np.zeros(0, int)
         middle, deviation = self.spread(values)
-        least, greatest = float(found.min()), float(found.max())
+        smallest, greatest = float(known_values.min()), float(known_values.max())
         if deviation > 0:
             reach = self.settings.half_width * deviation
-            least, greatest = max(least, middle - reach), min(greatest, middle + reach)
-        if not greatest > least:
-            least, greatest = least - 0.5, greatest + 0.5
-        edges = np.linspace(least, greatest, self.settings.classes + 1)
-        edges[0] = -np.inf if found.min() < least else edges[0]
-        edges[-1] = np.inf if found.max() > greatest else edges[-1]
-        return edges, np.histogram(found, edges)[0]
+            smallest, greatest = max(smallest, middle - reach), min(greatest, middle + reach)
+        if not greatest > smallest:
+            smallest, greatest = smallest - 0.5, greatest + 0.5
+        edges = np.linspace(smallest, greatest, self.settings.classes + 1)
+        edges[0] = -np.inf if known_values.min() < smallest else edges[0]
+        edges[-1] = np.inf if known_values.max() > greatest else edges[-1]
+        return edges, np.histogram(known_values, edges)[0]
 
     def correlations(self, against: Mapping[str, np.ndarray]) -> list[Correlation]:
         """Correlations of every parameter and the RMS with every column of `against` (a number per
         row, NaN if missing), the most significant first."""
-        found = []
+        correlations = []
         for column, with_it in against.items():
             for name, values in {**self.values, "rms": self.numbers["rms"]}.items():
-                used = self.fit & np.isfinite(values) & np.isfinite(with_it)
-                varies = lambda x, used=used: np.ptp(x[used]) > 0
-                enough = used.sum() >= self.settings.min_cameras
-                if enough and varies(with_it) and varies(values):
-                    found.append(_correlation(column, name, with_it[used], values[used]))
-        return sorted(found, key=lambda one: (one.probability, -abs(one.rank_correlation)))
+                is_used = self.fit & np.isfinite(values) & np.isfinite(with_it)
+                varies = lambda x, is_used=is_used: np.ptp(x[is_used]) > 0
+                has_enough = is_used.sum() >= self.settings.min_cameras
+                if has_enough and varies(with_it) and varies(values):
+                    correlations.append(
+                        _correlation(column, name, with_it[is_used], values[is_used])
+                    )
+        return sorted(
+            correlations,
+            key=lambda correlation: (correlation.probability, -abs(correlation.rank_correlation)),
+        )
 
     def summary(self, against: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
         """The population as plain dicts and numbers."""
         names, counts = np.unique(self.status.astype(str), return_counts=True)
-        of = {**self.values, "rms": self.numbers["rms"]}
+        columns = {**self.values, "rms": self.numbers["rms"]}
         parameters = {}
-        for name, values in of.items():
-            there = values[self.fit & np.isfinite(values)]
-            if not len(there):
+        for name, values in columns.items():
+            known_values = values[self.fit & np.isfinite(values)]
+            if not len(known_values):
                 continue
             middle, deviation = self.spread(values)
             edges, counted = self.histogram(values)
             parameters[name] = {
-                "cameras": len(there),
+                "cameras": len(known_values),
                 "median": middle,
                 "robust_sigma": deviation,
-                "least": float(there.min()),
-                "greatest": float(there.max()),
+                "least": float(known_values.min()),
+                "greatest": float(known_values.max()),
                 "histogram": {"edges": edges.tolist(), "numbers": counted.tolist()},
             }
             if name in self.sigma:
                 parameters[name]["median_sigma"] = self.spread(self.sigma[name])[0]
-        found = self.correlations(against or {})
+        correlations = self.correlations(against or {})
         return {
             "inputs": len(self),
             "status": dict(zip(names.tolist(), counts.tolist())),
@@ -222,8 +227,9 @@ class Population:
             "parameters": parameters,
             "outlying": [{"key": self.keys[i], "why": why} for i, why in self.outlying()],
             "correlations": [
-                vars(one) | {"significant": one.probability < self.settings.level / len(found)}
-                for one in found
+                vars(correlation)
+                | {"significant": correlation.probability < self.settings.level / len(correlations)}
+                for correlation in correlations
             ],
         }
 
@@ -241,33 +247,35 @@ class Population:
 def _row(row: Mapping) -> dict:
     """The data of a line used by the population, without poses and covariances."""
     names = ("key", "status", "remark", "rms", "sigma0", "redundancy", "iterations", "views")
-    found = {name: row[name] for name in names if name in row}
+    used_entries = {name: row[name] for name in names if name in row}
     removed = row.get("removed")
-    found["removed"] = len(removed) if isinstance(removed, list) else removed
-    found["remark"] = row.get("remark") or row.get("error", "")
+    used_entries["removed"] = len(removed) if isinstance(removed, list) else removed
+    used_entries["remark"] = row.get("remark") or row.get("error", "")
     cameras = (row.get("cameras") or {}).values()
-    found["models"] = {row.get("model"), *(c.get("model") for c in cameras)} - {None}
-    return found | {"parameters": row["parameters"] if "parameters" in row else _of_network(row)}
+    used_entries["models"] = {row.get("model"), *(c.get("model") for c in cameras)} - {None}
+    return used_entries | {
+        "parameters": row["parameters"] if "parameters" in row else _of_network(row)
+    }
 
 
 def _of_network(row: Mapping) -> dict[str, dict]:
     """Estimates of a network that are not held and belong to no single image: free parameters of
     its cameras (with the camera's id where there are several), mountings, boresights and the
     like."""
-    found, cameras = {}, row.get("cameras") or {}
+    estimates_found, cameras = {}, row.get("cameras") or {}
     for id, camera in cameras.items():
-        for name, one in camera["parameters"].items():
-            if one.get("free"):
-                found[name if len(cameras) == 1 else f"{id} {name}"] = one
+        for name, estimate in camera["parameters"].items():
+            if estimate.get("free"):
+                estimates_found[name if len(cameras) == 1 else f"{id} {name}"] = estimate
     for table, unknowns in (row.get("further_unknowns") or {}).items():
-        for of, estimates in unknowns.items():
-            if of not in row.get("images", {}):
-                found |= {
-                    f"{table} {of} {name}": one
-                    for name, one in estimates.items()
-                    if one["sigma"] != 0
+        for object_id, estimates in unknowns.items():
+            if object_id not in row.get("images", {}):
+                estimates_found |= {
+                    f"{table} {object_id} {name}": estimate
+                    for name, estimate in estimates.items()
+                    if estimate["sigma"] != 0
                 }
-    return found
+    return estimates_found
 
 
 def _correlation(
@@ -294,40 +302,40 @@ def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.nda
 
     **Raises:** `InputError` for a table without `id`, or without another column, for a repeated id,
     a cell that is neither number nor date, and no matching key."""
-    given: Columns = as_columns(table, name)
-    others = [column for column in given.values if column != ID]
-    if ID not in given.values or not others:
+    columns_given: Columns = as_columns(table, name)
+    value_columns = [column for column in columns_given.values if column != ID]
+    if ID not in columns_given.values or not value_columns:
         raise InputError(
             f"{name}: expected a column id and others, but there are "
-            f"{', '.join(given.values) or 'none'}"
+            f"{', '.join(columns_given.values) or 'none'}"
         )
     rows: dict[str, int] = {}
-    for row, id in enumerate(given.ids(ID)):
+    for row, id in enumerate(columns_given.ids(ID)):
         if id in rows:
-            raise InputError(f"{given.source(row)}: id {id!r} occurs twice")
+            raise InputError(f"{columns_given.source(row)}: id {id!r} occurs twice")
         rows[id] = row
     keys = list(keys)
     # Keys are PATH#CAMERA; a table of serial numbers knows only the camera.
     place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]
     if all(row is None for row in place):
         raise InputError(f"{name}: expected ids of cameras or inputs; none of its ids is one")
-    chosen = np.array([-1 if row is None else row for row in place], int)
-    found = {}
-    for column in others:
-        values = np.append(_numbers(given, column), np.nan)  # row −1: missing
-        found[column] = values[chosen]
-    return found
+    row_of_key = np.array([-1 if row is None else row for row in place], int)
+    chosen_values = {}
+    for column in value_columns:
+        values = np.append(_numbers(columns_given, column), np.nan)  # row −1: missing
+        chosen_values[column] = values[row_of_key]
+    return chosen_values
 
 
-def _numbers(given: Columns, column: str) -> np.ndarray:
+def _numbers(columns: Columns, column: str) -> np.ndarray:
     """Numbers, or dates as days since 1970; NaN where a cell is empty."""
-    cells = [str(cell).strip() if cell is not None else "" for cell in given.values[column]]
-    found = np.full(len(cells), np.nan)
+    cells = [str(cell).strip() if cell is not None else "" for cell in columns.values[column]]
+    values = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
         if cell in ("", "nan", "None", "NaT"):
             continue
-        found[row] = number_or_days(cell, f"{given.source(row)}: {column}")
-    return found
+        values[row] = number_or_days(cell, f"{columns.source(row)}: {column}")
+    return values
 
 
 def number_or_days(cell: str, where: str) -> float:

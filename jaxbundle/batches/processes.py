@@ -48,8 +48,8 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options: Any) -
     # A name of this run, the same in all processes, so that files of an earlier one do not count.
     token = int(broadcast_one_to_all(np.array(time.time_ns() % 10**9)))
     waiting = f"{file}.joined-{token}"
-    own = {key: value for key, value in options.items() if key not in ("retry", "renew")}
-    failed, counts = None, Counter()
+    own_options = {key: value for key, value in options.items() if key not in ("retry", "renew")}
+    error_here, counts = None, Counter()
     if index == 0:
         _clear(file, waiting)
     try:
@@ -60,24 +60,24 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options: Any) -
             # Into a file of its own: appending to one file from several machines is not atomic.
             part = f"{file}.part-{index + 1}-of-{number}"
             with use_own_devices():
-                run_batch(inputs, part, part=(index + 1, number), known=file, **own)
+                run_batch(inputs, part, part=(index + 1, number), known=file, **own_options)
     except Exception as error:
-        failed = error
+        error_here = error
         if index == 0:
             _tell(waiting, "begin", _in_words(error))
-    _tell(waiting, str(index), "" if failed is None else _in_words(failed))
-    others = _wait(waiting, list(map(str, range(number))))
+    _tell(waiting, str(index), "" if error_here is None else _in_words(error_here))
+    reports = _wait(waiting, list(map(str, range(number))))
     jax.distributed.shutdown()  # A barrier: from here every process is on its own.
     if index == 0:
         shutil.rmtree(waiting, ignore_errors=True)
-    if failed is not None:
-        raise failed
-    for other, why in others.items():
+    if error_here is not None:
+        raise error_here
+    for other_process, why in reports.items():
         if why:
-            raise NotSolvedError(f"process {other} of the joined ones has failed: {why}")
+            raise NotSolvedError(f"process {other_process} of the joined ones has failed: {why}")
     if index == 0:
         add_parts(file)
-        counts = run_batch(inputs, file, compute=False, **own)
+        counts = run_batch(inputs, file, compute=False, **own_options)
     return counts
 
 
@@ -104,13 +104,13 @@ def _tell(waiting: str, name: str, words: str = "") -> None:
 def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
     """The reports of these processes, once all are there."""
     while True:
-        found = {
+        reports = {
             name: Path(waiting, name).read_text("utf-8")
             for name in names
             if Path(waiting, name).exists()
         }
-        if len(found) == len(names):
-            return found
+        if len(reports) == len(names):
+            return reports
         time.sleep(0.2)  # seconds: far below a run, far above the look at a file
 
 
@@ -119,19 +119,19 @@ def add_parts(file: str | Path) -> None:
     joined processes.
 
     **Raises:** `InputError` while a run writes one of them."""
-    found = [
+    parts_found = [
         (int(end[1]), path)
         for path in glob.glob(f"{glob.escape(str(file))}.part-*")
         if (end := re.search(r"\.part-(\d+)-of-\d+$", path))
     ]
     waited = glob.glob(f"{glob.escape(str(file))}.joined-*")
-    if not found and not waited:
+    if not parts_found and not waited:
         return
-    with ExitStack() as held:
-        held.enter_context(hold_lock(file))
-        for _, path in found:
-            held.enter_context(hold_lock(path))
-        parts = [JsonLines(path) for _, path in sorted(found)]
+    with ExitStack() as locks:
+        locks.enter_context(hold_lock(file))
+        for _, path in parts_found:
+            locks.enter_context(hold_lock(path))
+        parts = [JsonLines(path) for _, path in sorted(parts_found)]
         lines, some = JsonLines(file), []
         # Parts have every N-th input: taken in turn they are in the order of the inputs.
         in_turn = chain.from_iterable(zip_longest(*(part.rows(part.heads) for part in parts)))
@@ -142,7 +142,7 @@ def add_parts(file: str | Path) -> None:
                 lines.append(some)
                 some = []
         lines.append(some)
-        for _, path in found:
+        for _, path in parts_found:
             os.remove(path)
     for path in waited:
         shutil.rmtree(path, ignore_errors=True)

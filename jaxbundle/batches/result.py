@@ -144,24 +144,26 @@ class BatchCalibration(TableMethods):
         names, counts = np.unique(self.status, return_counts=True)
         states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
         rms = f"median RMS {np.nanmedian(self.rms):.4g} px" if self.solved.any() else "no result"
-        said = [f"{len(self)} cameras, model {self.model}: {states}; {rms}"]
+        lines_of_summary = [f"{len(self)} cameras, model {self.model}: {states}; {rms}"]
         if np.isfinite(self.sigma_ratio):
-            said.append(
+            lines_of_summary.append(
                 f"σ under correlated errors {significant(self.sigma_ratio, 3)} times the classical "
                 "ones (median)"
             )
         if self.removed is not None:
-            said.append(f"{int(self.removed.sum())} image points removed by data snooping")
-        remarks, first, counts = np.unique(self.remark, return_index=True, return_counts=True)
+            lines_of_summary.append(
+                f"{int(self.removed.sum())} image points removed by data snooping"
+            )
+        remarks, first_row, counts = np.unique(self.remark, return_index=True, return_counts=True)
         lines = [
             f"camera {row}{f' and {count - 1} more' if count > 1 else ''}: {remark}"
-            for row, remark, count in sorted(zip(first, remarks, counts))
+            for row, remark, count in sorted(zip(first_row, remarks, counts))
             if remark
         ]
-        shown = 10  # of remarks that differ
-        if len(lines) > shown:
-            lines[shown:] = [f"and {len(lines) - shown} more remarks, see `remark`"]
-        return "\n".join(said + lines)
+        max_shown = 10  # of remarks that differ
+        if len(lines) > max_shown:
+            lines[max_shown:] = [f"and {len(lines) - max_shown} more remarks, see `remark`"]
+        return "\n".join(lines_of_summary + lines)
 
     def row(self, i: int, brief: bool = False, views: int | None = None) -> dict:
         """The result of camera i as plain dicts and numbers (angles in radians), as a line of
@@ -178,8 +180,8 @@ class BatchCalibration(TableMethods):
         if self.remark[i]:
             row["remark"] = str(self.remark[i])
         if self.removed is not None:
-            removed = np.argwhere(self.removed[i])
-            row["removed"] = len(removed) if brief else removed.tolist()
+            removed_points = np.argwhere(self.removed[i])
+            row["removed"] = len(removed_points) if brief else removed_points.tolist()
         if self.undetermined[i].any():
             row["undetermined"] = np.array(self.parameters)[self.undetermined[i]].tolist()
         if not self.solved[i]:
@@ -245,16 +247,17 @@ class BatchCalibration(TableMethods):
             del table["remark"]
         rows = np.argsort(self.converged, kind="stable")[:20]  # a screen
         cell = 'style="text-align:left;padding:2px 12px 2px 0"'
-        shown = lambda x: f"{x:.6g}" if isinstance(x, float | np.floating) else escape(str(x))
+        cell_text = lambda x: f"{x:.6g}" if isinstance(x, float | np.floating) else escape(str(x))
         line = lambda tag, texts: (
             "<tr>" + "".join(f"<{tag} {cell}>{text}</{tag}>" for text in texts) + "</tr>"
         )
         body = "".join(
-            line("td", [row, *(shown(column[row]) for column in table.values())]) for row in rows
+            line("td", [row, *(cell_text(column[row]) for column in table.values())])
+            for row in rows
         )
-        more = f"<p>and {len(self) - len(rows)} more</p>" if len(self) > len(rows) else ""
+        rest_in_words = f"<p>and {len(self) - len(rows)} more</p>" if len(self) > len(rows) else ""
         head = "<br>".join(map(escape, str(self).splitlines()))
         return (
             f'<div><b>{head}</b><table style="border-collapse:collapse;font-size:90%">'
-            f"{line('th', ['camera', *table])}{body}</table>{more}</div>"
+            f"{line('th', ['camera', *table])}{body}</table>{rest_in_words}</div>"
         )

@@ -32,22 +32,26 @@ class RigFolders:
     def fingerprint(self, rig: int) -> str:
         """The fingerprint of the content of the photographs of all cameras."""
         cameras = camera_folders(self.folders[rig])
-        found = self._folders_of([str(path) for path in cameras])
-        return of_words(f"{path.name} {found.fingerprint(c)}" for c, path in enumerate(cameras))
+        folders_of_cameras = self._folders_of([str(path) for path in cameras])
+        return of_words(
+            f"{path.name} {folders_of_cameras.fingerprint(c)}" for c, path in enumerate(cameras)
+        )
 
     def measure(
-        self, chosen: Sequence[int], tell: Callable[[float], None]
+        self, rigs: Sequence[int], tell: Callable[[float], None]
     ) -> dict[int, tuple[RigViews, dict] | str]:
         """Some of the rigs, with what a line says of their photographs; or why there is none."""
-        cameras = {i: camera_folders(self.folders[i]) for i in chosen}
-        every = [(i, path) for i, of in cameras.items() for path in of]
+        cameras = {i: camera_folders(self.folders[i]) for i in rigs}
+        all_folders = [
+            (i, path) for i, folders_of_rig in cameras.items() for path in folders_of_rig
+        ]
         # All folders of all rigs at once, so that the processes are never idle.
-        found = self._folders_of([str(path) for _, path in every])
-        views = found.measure(range(len(every)), tell) if every else {}
-        of_rig: dict[int, dict[str, BoardViews | str]] = {i: {} for i in chosen}
-        for (i, path), one in zip(every, views.values()):
-            of_rig[i][path.name] = one
-        return {i: _rig(of) for i, of in of_rig.items()}
+        photograph_folders = self._folders_of([str(path) for _, path in all_folders])
+        views = photograph_folders.measure(range(len(all_folders)), tell) if all_folders else {}
+        of_rig: dict[int, dict[str, BoardViews | str]] = {i: {} for i in rigs}
+        for (i, path), views_or_reason in zip(all_folders, views.values()):
+            of_rig[i][path.name] = views_or_reason
+        return {i: _rig(folders_of_rig) for i, folders_of_rig in of_rig.items()}
 
     def _folders_of(self, folders: Sequence[str]) -> PhotographFolders:
         return PhotographFolders(folders, self.board, self.kept, self.workers)
@@ -55,37 +59,52 @@ class RigFolders:
 
 def _rig(views: Mapping[str, BoardViews | str]) -> tuple[RigViews, dict] | str:
     if len(views) < 2:
-        said = f" (only {[*views][0]})" if views else ""
-        return f"expected a folder of photographs for every camera of the rig here{said}"
-    bad = [f"camera {name}: {one}" for name, one in views.items() if isinstance(one, str)]
+        only_camera = f" (only {[*views][0]})" if views else ""
+        return f"expected a folder of photographs for every camera of the rig here{only_camera}"
+    bad = [
+        f"camera {name}: {views_of_camera}"
+        for name, views_of_camera in views.items()
+        if isinstance(views_of_camera, str)
+    ]
     if bad:
         return "; ".join(bad)
-    given = {name: one for name, one in views.items() if not isinstance(one, str)}
+    usable_views = {
+        name: views_of_camera
+        for name, views_of_camera in views.items()
+        if not isinstance(views_of_camera, str)
+    }
     try:
-        rig = rig_of_views(given)
+        rig = rig_of_views(usable_views)
     except InputError as error:
         return str(error)
-    failed = {f"{name}/{photo}": why for name, one in given.items() for photo, why in one.failed}
-    return rig, of_unused(failed)
+    failures = {
+        f"{name}/{photo}": why
+        for name, views_of_camera in usable_views.items()
+        for photo, why in views_of_camera.failed
+    }
+    return rig, of_unused(failures)
 
 
 def rig_of_views(views: Mapping[str, BoardViews]) -> RigViews:
     """The rig of the views of its cameras.
 
     **Raises:** `InputError` where the photographs of two cameras cannot be paired."""
-    names = {name: one.names for name, one in views.items()}
-    keys = {name: list(of) for name, of in names.items()}
+    names = {name: views_of_camera.names for name, views_of_camera in views.items()}
+    keys = {name: list(names_of_camera) for name, names_of_camera in names.items()}
     if len(views) > 1:
         keys = epoch_keys(names)
     epochs = tuple(dict.fromkeys(key for name in views for key in keys[name]))
     board = next(iter(views.values())).board
     xy = np.full((len(views), len(epochs), len(board.ids), 2), np.nan)
     images = []
-    for c, (name, one) in enumerate(views.items()):
+    for c, (name, views_of_camera) in enumerate(views.items()):
         rows = [epochs.index(key) for key in keys[name]]
-        xy[c, rows] = one.xy
+        xy[c, rows] = views_of_camera.xy
         prefix = f"{name}/" if len(views) > 1 else ""
-        photo = dict(zip(rows, one.names))
+        photo = dict(zip(rows, views_of_camera.names))
         images.append(tuple(f"{prefix}{photo.get(e, epoch)}" for e, epoch in enumerate(epochs)))
-    sizes = tuple((int(one.image_size[0]), int(one.image_size[1])) for one in views.values())
+    sizes = tuple(
+        (int(views_of_camera.image_size[0]), int(views_of_camera.image_size[1]))
+        for views_of_camera in views.values()
+    )
     return RigViews(tuple(views), sizes, tuple(images), epochs, board.points, xy)

@@ -81,8 +81,8 @@ def solve_rigs(
 
     `tell(part)`: the fraction done."""
     firsts, solved = _first_cameras(rigs, settings), []
-    for number, (rig, first) in enumerate(zip(rigs, firsts), 1):
-        solved.append(_solve(rig, first, settings))
+    for number, (rig, first_cameras_of_rig) in enumerate(zip(rigs, firsts), 1):
+        solved.append(_solve(rig, first_cameras_of_rig, settings))
         tell(number / len(rigs))
     # Misfits in the end, since they are found by comparison with the other rigs.
     lengths = [_residual_lengths(result, settings) for _, result in solved]
@@ -100,23 +100,28 @@ def _first_cameras(
 ) -> list[list[FirstCamera | None]]:
     """The cameras of every rig, those of one image size calibrated together; None for one without
     finite measurements, or with one beyond LARGEST_NUMBER, which counts as infinite."""
-    found: list[list[FirstCamera | None]] = [[None] * len(rig.cameras) for rig in rigs]
+    cameras_of_rigs: list[list[FirstCamera | None]] = [[None] * len(rig.cameras) for rig in rigs]
     places: dict[tuple, list[tuple[int, int]]] = {}
     for i, rig in enumerate(rigs):
         for c, size in enumerate(rig.sizes):
             # One call of `calibrate_batch` has one image size and one number of points.
             if not (np.abs(rig.xy[c]) > LARGEST_NUMBER).any() and np.isfinite(rig.xy[c]).any():
                 places.setdefault((size, len(rig.points)), []).append((i, c))
-    for (size, points), of in places.items():
-        xy = np.full((len(of), max(len(rigs[i].epochs) for i, _ in of), points, 2), np.nan)
-        for row, (i, c) in enumerate(of):
+    for (size, points), places_of_size in places.items():
+        xy = np.full(
+            (len(places_of_size), max(len(rigs[i].epochs) for i, _ in places_of_size), points, 2),
+            np.nan,
+        )
+        for row, (i, c) in enumerate(places_of_size):
             xy[row, : len(rigs[i].epochs)] = rigs[i].xy[c]
         # One list of points if all have the same, which saves memory and keeps them exact.
-        X = np.array([rigs[i].points for i, _ in of])
+        X = np.array([rigs[i].points for i, _ in places_of_size])
         X = X[0] if (X == X[:1]).all() else X
-        for (i, c), first in zip(of, first_cameras(X, xy, size, settings.model, settings.free)):
-            found[i][c] = first
-    return found
+        for (i, c), first_camera in zip(
+            places_of_size, first_cameras(X, xy, size, settings.model, settings.free)
+        ):
+            cameras_of_rigs[i][c] = first_camera
+    return cameras_of_rigs
 
 
 def _solve(
@@ -183,7 +188,7 @@ def _adjust(
 
 def _contradicting(rig: RigViews, result: Adjustment, settings: RigSettings) -> dict[int, float]:
     """Epochs that contradict the mounting, and their RMS, pixels."""
-    place = {id: e for of in rig.images for e, id in enumerate(of)}
+    place = {id: e for images_of_epoch in rig.images for e, id in enumerate(images_of_epoch)}
     epoch = np.array([place[id] for id in result.problem.network.images.id])
     of_ray = epoch[result.problem.image]
     lengths = settings.sigma * np.hypot(*result.inspection.image_residuals.T)
@@ -197,24 +202,24 @@ def _residual_lengths(result: Adjustment | None, settings: RigSettings) -> Float
     """Residual lengths of the image points used, pixels."""
     if result is None:
         return np.zeros(0)
-    used = (result.problem.image_weights > 0).all(1)
+    has_weight = (result.problem.image_weights > 0).all(1)
     # v/σ times σ in pixels: pixels, also of a model in mm.
     v = settings.sigma * result.inspection.image_residuals
-    return np.hypot(*v.T)[used]
+    return np.hypot(*v.T)[has_weight]
 
 
 def _undetermined(result: Adjustment, settings: RigSettings) -> list[str]:
     """Principal distances and points that the views do not determine."""
-    model, found = settings.model, []
+    model, undetermined = settings.model, []
     free = tuple(map(model.parameters.index, settings.free))
     for id, camera in result.cameras.items():
-        of = camera["parameters"]
-        values = np.array([[of[name]["value"] for name in model.parameters]])
-        sigma = np.array([[of[name]["sigma"] for name in settings.free]])
+        parameters = camera["parameters"]
+        values = np.array([[parameters[name]["value"] for name in model.parameters]])
+        sigma = np.array([[parameters[name]["sigma"] for name in settings.free]])
         weak = is_vague(model, free, values, sigma)[0]
         prefix = f"{id} " if len(result.cameras) > 1 else ""
-        found += [f"{prefix}{settings.free[k]}" for k in np.flatnonzero(weak)]
-    return found
+        undetermined += [f"{prefix}{settings.free[k]}" for k in np.flatnonzero(weak)]
+    return undetermined
 
 
 def declare_rig(
@@ -227,15 +232,23 @@ def declare_rig(
     cameras, images, rays = [], [], []
     prior = {name: s for name, s in dict(model.prior).items() if name in settings.free}
     sigma = settings.sigma * np.array(size_of_pixel if model.unit == "mm" else (1.0, 1.0))
-    for c, (name, first) in enumerate(zip(rig.cameras, firsts)):
-        if first is None or not first.solved:
-            why = "no finite image points, or one above 1e100" if first is None else first.status
+    for c, (name, first_camera) in enumerate(zip(rig.cameras, firsts)):
+        if first_camera is None or not first_camera.solved:
+            why = (
+                "no finite image points, or one above 1e100"
+                if first_camera is None
+                else first_camera.status
+            )
             where = f"camera {name}: " if len(rig.cameras) > 1 else ""
             raise NotSolvedError(f"{where}its views do not determine it ({why})")
-        there = np.isfinite(rig.points).all(1)
-        seen = np.isfinite(rig.xy[c]).all(-1) & there & first.views[: len(rig.epochs), None]
+        has_coordinates = np.isfinite(rig.points).all(1)
+        is_seen = (
+            np.isfinite(rig.xy[c]).all(-1)
+            & has_coordinates
+            & first_camera.views[: len(rig.epochs), None]
+        )
         parameters = parameters_of(
-            first, rig.xy[c][seen], rig.sizes[c], model, settings.free, size_of_pixel
+            first_camera, rig.xy[c][is_seen], rig.sizes[c], model, settings.free, size_of_pixel
         )
         cameras.append(
             Camera(
@@ -249,9 +262,9 @@ def declare_rig(
             )
         )
         xy = in_model_units(rig.xy[c], model, rig.sizes[c], size_of_pixel)
-        for e in np.flatnonzero(seen.any(1)):
-            images.append((c, int(e), *first.position[e], *first.angles[e]))
-            rays += [(len(images) - 1, p, *xy[e, p]) for p in np.flatnonzero(seen[e])]
+        for e in np.flatnonzero(is_seen.any(1)):
+            images.append((c, int(e), *first_camera.position[e], *first_camera.angles[e]))
+            rays += [(len(images) - 1, p, *xy[e, p]) for p in np.flatnonzero(is_seen[e])]
     return _network_of(rig, cameras, images, np.array(rays), sigma, settings)
 
 
@@ -272,18 +285,18 @@ def _network_of(
     ids = np.array([rig.images[c][e] for c, e, *_ in images], dtype=object)
     names = [rig.cameras[c] for c, *_ in images]
     pose = np.array([row[2:] for row in images])
-    there = np.all(np.isfinite(rig.points), axis=1)
-    X, Y, Z = np.where(there[:, None], rig.points, 0.0).T
+    has_coordinates = np.all(np.isfinite(rig.points), axis=1)
+    X, Y, Z = np.where(has_coordinates[:, None], rig.points, 0.0).T
     points = np.array([str(p) for p in range(len(X))], dtype=object)
     image, point = rays[:, 0].astype(int), rays[:, 1].astype(int)
-    further: dict[str, Any] = {}
+    further_tables: dict[str, Any] = {}
     if len(rig.cameras) > 1:
         epochs = [rig.epochs[e] for _, e, *_ in images]
-        further["rigs"] = {"rig": ["rig"] * len(ids), "epoch": epochs, "image": ids}
-        further["rig"] = {"reference": rig.cameras[0], **settings.sections.get("rig", {})}
+        further_tables["rigs"] = {"rig": ["rig"] * len(ids), "epoch": epochs, "image": ids}
+        further_tables["rig"] = {"reference": rig.cameras[0], **settings.sections.get("rig", {})}
     if moves := settings.sections.get("rolling_shutter"):
-        further["velocities"] = {"image": ids}
-        further["rolling_shutter"] = with_free(moves)
+        further_tables["velocities"] = {"image": ids}
+        further_tables["rolling_shutter"] = with_free(moves)
     return make_network(
         cameras,
         {"id": ids, "camera": names}
@@ -300,5 +313,5 @@ def _network_of(
         residuals="measured",
         image_unit=settings.model.unit,
         sigma_origin=UNIT if settings.sigma_image is None else STATED,
-        **further,
+        **further_tables,
     )

@@ -97,47 +97,53 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
     """
     portion = integer("portion", portion)
     check_part(part)
-    asked = BatchSettings.check(
+    batch_settings = BatchSettings.check(
         model, free, board, rig, pixel_size, settings, max_iterations, snooping, significance, brief
     )
-    asked = dataclasses.replace(asked, correlated=correlated)
+    batch_settings = dataclasses.replace(batch_settings, correlated=correlated)
     for path in inputs:
         if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")
-    with ExitStack() as held:
-        held.enter_context(hold_lock(file))
-        works = plan_works({key_of(path, file): str(path) for path in inputs}, file, asked, held)
-        ours = _shares([len(work.keys) for work in works], part)
-        total = sum(map(len, ours))
+    with ExitStack() as locks:
+        locks.enter_context(hold_lock(file))
+        works = plan_works(
+            {key_of(path, file): str(path) for path in inputs}, file, batch_settings, locks
+        )
+        shares_of_part = _shares([len(work.keys) for work in works], part)
+        total = sum(map(len, shares_of_part))
         lines = JsonLines(file)
         # All inputs are checked before anything is dropped: an error leaves the file as it was.
-        again = [
+        to_recompute = [
             key
-            for work, share in zip(works, ours)
-            for key in _again(work, share, lines, retry, renew)
+            for work, share in zip(works, shares_of_part)
+            for key in _to_recompute(work, share, lines, retry, renew)
         ]
-        if again:
-            lines.drop(again)
-        counts, done, networks = Counter(), 0, 0
+        if to_recompute:
+            lines.drop(to_recompute)
+        counts, number_done, networks = Counter(), 0, 0
         # By key, not by position, so that inputs may be added, left out, and reordered between runs
-        have = {*lines.heads} | ({*JsonLines(known).heads} if known is not None else set())
-        for work, share in zip(works, ours) if compute else ():
-            chosen = np.array([i for i in share if work.keys[i] not in have], int)
-            counts["skipped"] += len(share) - len(chosen)
-            done += len(share) - len(chosen)
-            progress(STAGE, done, total)
+        keys_in_file = {*lines.heads} | ({*JsonLines(known).heads} if known is not None else set())
+        for work, share in zip(works, shares_of_part) if compute else ():
+            rows_to_compute = np.array([i for i in share if work.keys[i] not in keys_in_file], int)
+            counts["skipped"] += len(share) - len(rows_to_compute)
+            number_done += len(share) - len(rows_to_compute)
+            progress(STAGE, number_done, total)
             step = min(portion, work.portion)
-            for first in range(0, len(chosen), step):
-                some = chosen[first : first + step].tolist()
-                rows = _rows(work, some, partial(_tell, progress, done, len(some), total))
+            for begin in range(0, len(rows_to_compute), step):
+                rows_of_step = rows_to_compute[begin : begin + step].tolist()
+                rows = _rows(
+                    work,
+                    rows_of_step,
+                    partial(_tell, progress, number_done, len(rows_of_step), total),
+                )
                 lines.append(rows)
-                done += len(rows)
-                progress(STAGE, done, total)
+                number_done += len(rows)
+                progress(STAGE, number_done, total)
                 networks += work.is_network
                 # Networks of many sizes leave a compiled program each: dropped from time to time.
                 if work.is_network and networks % 50 == 0:
                     jax.clear_caches()
-    keys = (work.keys[i] for work, share in zip(works, ours) for i in share)
+    keys = (work.keys[i] for work, share in zip(works, shares_of_part) for i in share)
     heads = (lines.heads[key] for key in keys if key in lines)
     return Counter(str(head.get("status", "unknown")) for head in heads) + counts
 
@@ -145,10 +151,10 @@ def run_batch(  # noqa: PLR0913 keyword arguments of a public function
 def result_rows(inputs: Sequence[str | Path], file: str | Path) -> Iterator[dict]:
     """The lines of these inputs in a file of results, in its order, as `run_batch` wrote them."""
     names = {key_of(path, file) for path in inputs}
-    ours = lambda key: key in names or any(key.startswith(f"{name}#") for name in names)
+    is_of_inputs = lambda key: key in names or any(key.startswith(f"{name}#") for name in names)
     with hold_lock(file):
         lines = JsonLines(file)
-        yield from lines.rows(filter(ours, lines.heads))
+        yield from lines.rows(filter(is_of_inputs, lines.heads))
 
 
 def key_of(path: str | Path, file: str | Path) -> str:
@@ -172,48 +178,55 @@ def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
     ends = [0, *itertools.accumulate(numbers)]
     # Every N-th, not a block: inputs of similar size are often neighbours, and the parts take
     # equally long.
-    ranges = [range(first, last) for first, last in zip(ends, ends[1:])]
+    ranges = [range(begin, end) for begin, end in zip(ends, ends[1:])]
     return [[i - r.start for i in r if i % part[1] == part[0] - 1] for r in ranges]
 
 
-def _tell(progress: Progress, done: int, number: int, total: int, part: float) -> None:
+def _tell(progress: Progress, number_done: int, number: int, total: int, part: float) -> None:
     """Report that a fraction `part` of `number` inputs is done."""
-    progress(STAGE, done + int(part * number), total)
+    progress(STAGE, number_done + int(part * number), total)
 
 
-def _rows(work: Work, chosen: Sequence[int], tell: ShareDone) -> list[dict]:
+def _rows(work: Work, rows: Sequence[int], tell: ShareDone) -> list[dict]:
     # Before the computation, so that later changes are detected.
-    data = [work.data(i) for i in chosen]
+    data = [work.data(i) for i in rows]
     return [
-        {"key": work.keys[i], "status": row["status"], "settings": work.settings, "data": of} | row
-        for i, of, row in zip(chosen, data, work.solve(chosen, tell))
+        {
+            "key": work.keys[i],
+            "status": row["status"],
+            "settings": work.settings,
+            "data": data_of_input,
+        }
+        | row
+        for i, data_of_input, row in zip(rows, data, work.solve(rows, tell))
     ]
 
 
-def _again(
+def _to_recompute(
     work: Work, share: Sequence[int], lines: JsonLines, retry: bool, renew: bool
 ) -> list[str]:
     """The keys of an input that are in the file and must be recomputed.
 
     **Raises:** `InputError` for a line with other settings or data, without `renew`."""
-    again, other = [], {}
+    keys_to_recompute, differing_keys = [], {}
     for i in share:
         key = work.keys[i]
         head = lines.heads.get(key)
         if head is None:
             continue
         if retry and (head.get("status") not in SOLVED or head.get(NOT_SEARCHED)):
-            again.append(key)
+            keys_to_recompute.append(key)
         elif difference := _difference(head, work, i):
-            other[key] = difference
-    if other and not renew:
-        key, difference = next(iter(other.items()))
+            differing_keys[key] = difference
+    if differing_keys and not renew:
+        key, difference = next(iter(differing_keys.items()))
         raise InputError(
-            f"{lines.path}: has {len(other)} of these inputs from other settings or other data, "
+            f"{lines.path}: has {len(differing_keys)} of these inputs from other settings or "
+            "other data, "
             f"{key}: {difference}; give another file to --json-lines, or recompute them with "
             "--renew"
         )
-    return [*again, *other]
+    return [*keys_to_recompute, *differing_keys]
 
 
 def _difference(head: dict, work: Work, i: int) -> str:

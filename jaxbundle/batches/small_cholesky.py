@@ -48,8 +48,8 @@ def backward(L: Rows, y: Sequence[Array]) -> list[Array]:
     """x of Lᵀ·x = y."""
     n, x = len(L), [*y]
     for i in reversed(range(n)):
-        below = range(i + 1, n)
-        x[i] = (y[i] - _dot([L[j][i] for j in below], [x[j] for j in below])) * L[i][i]
+        rows_below = range(i + 1, n)
+        x[i] = (y[i] - _dot([L[j][i] for j in rows_below], [x[j] for j in rows_below])) * L[i][i]
     return x
 
 

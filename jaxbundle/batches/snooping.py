@@ -24,10 +24,10 @@ MAX_ROUNDS = 200
 class Snooping:
     """The used points of one camera; `next` updates them after a solution."""
 
-    def __init__(self, seen: Bool[np.ndarray, "views points"], test: str, significance: float):
-        self.used, self.seen = seen.copy(), seen
+    def __init__(self, is_seen: Bool[np.ndarray, "views points"], test: str, significance: float):
+        self.used, self.seen = is_seen.copy(), is_seen
         self.test, self.significance = test, significance
-        self.returned = np.zeros_like(seen)
+        self.returned = np.zeros_like(is_seen)
 
     def next(
         self, tests: Float[np.ndarray, "views points"], sigma0: float, redundancy: int
@@ -53,7 +53,7 @@ class Snooping:
             self.used[rows, worst[rows]] = False
             return True
         # Each only once, so that no point alternates.
-        back = self.seen & ~self.used & ~self.returned & (tests < critical) & (tests > 0)
-        self.used |= back
-        self.returned |= back
-        return bool(back.any())
+        is_restored = self.seen & ~self.used & ~self.returned & (tests < critical) & (tests > 0)
+        self.used |= is_restored
+        self.returned |= is_restored
+        return bool(is_restored.any())

@@ -37,7 +37,7 @@ class SolvedPortions(NamedTuple):
     cameras: int
     views: int
 
-    def traced(self, together: bool) -> Bool[np.ndarray, " cameras"]:
+    def traced(self, common: bool) -> Bool[np.ndarray, " cameras"]:
         """Whose traces are needed: of every solved camera, or for one set of sizes of some of them,
         as far as there are with views enough for components by view."""
         solved, views = np.zeros((2, self.cameras), int)
@@ -45,64 +45,79 @@ class SolvedPortions(NamedTuple):
             number = len(portion.cameras)
             solved[portion.cameras] = rows["status"][:number] == CONVERGED
             views[portion.cameras] = rows["views"][:number].sum(1)
-        found = solved > 0
-        if together:
-            many = found & (views >= DEFAULTS.min_images)
-            chosen = np.flatnonzero(many if many.any() else found)
-            step = max(len(chosen) / SUMS.traced, 1)
-            found = np.zeros(self.cameras, bool)
-            found[chosen[np.arange(0, len(chosen), step).astype(int)]] = True
-        return found
+        is_traced = solved > 0
+        if common:
+            has_many_views = is_traced & (views >= DEFAULTS.min_images)
+            candidates = np.flatnonzero(has_many_views if has_many_views.any() else is_traced)
+            step = max(len(candidates) / SUMS.traced, 1)
+            is_traced = np.zeros(self.cameras, bool)
+            is_traced[candidates[np.arange(0, len(candidates), step).astype(int)]] = True
+        return is_traced
 
     def forms(self) -> ComponentForms:
         """Those of all cameras."""
         number = len(COMPONENTS)
-        q, given = np.zeros((self.cameras, number)), np.zeros(self.cameras)
+        q, number_given = np.zeros((self.cameras, number)), np.zeros(self.cameras)
         for portion, rows in zip(self.portions, self.rows):
-            found = forms_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows))
-            q[portion.cameras], given[portion.cameras] = _without_padding(portion, found)
-        return ComponentForms(q, given)
+            forms_found = forms_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows))
+            q[portion.cameras], number_given[portion.cameras] = _without_padding(
+                portion, forms_found
+            )
+        return ComponentForms(q, number_given)
 
-    def traces(self, wanted: Bool[np.ndarray, " cameras"]) -> ComponentTraces:
+    def traces(self, is_wanted: Bool[np.ndarray, " cameras"]) -> ComponentTraces:
         """Those of some cameras."""
         number = len(COMPONENTS)
         T, cubes = (np.zeros((self.cameras, *(number,) * n)) for n in (2, 3))
-        for portion, rows, some in self._wanted(wanted):
-            found = traces_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows), some)
-            T[portion.cameras], cubes[portion.cameras] = _without_padding(portion, found)
+        for portion, rows, wanted_of_portion in self._wanted(is_wanted):
+            traces_found = traces_of_portion(
+                self.key, DEFAULTS, *_adjusted(portion, rows), wanted_of_portion
+            )
+            T[portion.cameras], cubes[portion.cameras] = _without_padding(portion, traces_found)
         return ComponentTraces(T, cubes)
 
-    def parts(self, wanted: Bool[np.ndarray, "cameras k"]) -> ComponentParts:
+    def parts(self, is_wanted: Bool[np.ndarray, "cameras k"]) -> ComponentParts:
         """Those of some components of cameras."""
         number, k = len(COMPONENTS), len(self.key.free)
         remaining, interior = (np.zeros((self.cameras, number, *n)) for n in ((), (k, k)))
         pose = np.zeros((self.cameras, number, self.views, POSE))
-        for portion, rows, some in self._wanted(wanted):
+        for portion, rows, wanted_of_portion in self._wanted(is_wanted):
             adjusted = *_adjusted(portion, rows), portion.axes, portion.middle
-            found = parts_of_portion(self.key, DEFAULTS, *adjusted, some)
+            parts_found = parts_of_portion(self.key, DEFAULTS, *adjusted, wanted_of_portion)
             remaining[portion.cameras], interior[portion.cameras], padded = _without_padding(
-                portion, found
+                portion, parts_found
             )
-            of = portion.views.shape[1]
+            number_of_views = portion.views.shape[1]
             # Indices on both sides of a slice put the cameras and views in front.
-            pose[portion.cameras[:, None], :, portion.views] = padded.swapaxes(1, 2)[:, :of]
+            pose[portion.cameras[:, None], :, portion.views] = padded.swapaxes(1, 2)[
+                :, :number_of_views
+            ]
         return ComponentParts(remaining, interior, pose)
 
     def scatter(self, theta: Float[np.ndarray, "cameras k"]) -> Float[np.ndarray, "cameras k k"]:
         """The covariances of the forms of all cameras under errors of these sizes."""
-        found = np.zeros((self.cameras, len(COMPONENTS), len(COMPONENTS)))
-        for portion, rows, own in self._wanted(theta):
-            forms = scatter_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows), own)
-            (found[portion.cameras],) = _without_padding(portion, [forms])
-        return found
+        covariances = np.zeros((self.cameras, len(COMPONENTS), len(COMPONENTS)))
+        for portion, rows, theta_of_portion in self._wanted(theta):
+            forms = scatter_of_portion(
+                self.key, DEFAULTS, *_adjusted(portion, rows), theta_of_portion
+            )
+            (covariances[portion.cameras],) = _without_padding(portion, [forms])
+        return covariances
 
-    def _wanted(self, wanted: Shaped[np.ndarray, "cameras *axes"]) -> Any:
+    def _wanted(self, wanted_of_all: Shaped[np.ndarray, "cameras *axes"]) -> Any:
         """The portions with rows in which something is wanted, and what, filled up with zeros."""
         for portion, rows in zip(self.portions, self.rows):
-            own = wanted[portion.cameras]
-            if own.any():
-                missing = len(portion.axes) - len(own)
-                yield portion, rows, np.pad(own, [(0, missing), *[(0, 0)] * (own.ndim - 1)])
+            wanted_of_portion = wanted_of_all[portion.cameras]
+            if wanted_of_portion.any():
+                number_missing = len(portion.axes) - len(wanted_of_portion)
+                yield (
+                    portion,
+                    rows,
+                    np.pad(
+                        wanted_of_portion,
+                        [(0, number_missing), *[(0, 0)] * (wanted_of_portion.ndim - 1)],
+                    ),
+                )
 
 
 def _adjusted(portion: Portion, rows: Rows) -> tuple[Sightings, CameraUnknowns]:
@@ -111,9 +126,9 @@ def _adjusted(portion: Portion, rows: Rows) -> tuple[Sightings, CameraUnknowns]:
     if "removed" in rows:
         weight = weight * ~rows["removed"]
     numbers = portion.seen.point, portion.seen.xy, weight
-    seen = Sightings(*(np.asarray(x, float) for x in numbers))
-    return seen, CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
+    sightings = Sightings(*(np.asarray(x, float) for x in numbers))
+    return sightings, CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
 
 
-def _without_padding(portion: Portion, found: Sequence[Any]) -> list[np.ndarray]:
-    return [np.asarray(x)[: len(portion.cameras)] for x in found]
+def _without_padding(portion: Portion, padded: Sequence[Any]) -> list[np.ndarray]:
+    return [np.asarray(x)[: len(portion.cameras)] for x in padded]

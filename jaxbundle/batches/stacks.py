@@ -53,23 +53,23 @@ class CameraStack:
         """Whether its rows are rigs, not cameras."""
         return self.image_points.ndim == 5
 
-    def rigs(self, chosen: Sequence[int]) -> list[RigViews]:
+    def rigs(self, cameras: Sequence[int]) -> list[RigViews]:
         """Some of the rigs; a camera is a rig of one."""
-        given = self.arguments(np.asarray(chosen))
-        xy, visible = given["image_points"], given["visible"]
+        arguments = self.arguments(np.asarray(cameras))
+        xy, visible = arguments["image_points"], arguments["visible"]
         if not self.of_rigs:
             xy, visible = xy[:, None], None if visible is None else visible[:, None]
-        X = np.asarray(given["object_points"], float)
+        X = np.asarray(arguments["object_points"], float)
         return rigs_of_arrays(X, xy.astype(float), self.image_size, visible, self.cameras)
 
-    def arguments(self, chosen: np.ndarray) -> dict:
+    def arguments(self, cameras: np.ndarray) -> dict:
         """Arguments of `calibrate_batch` for some of the cameras."""
         X = self.object_points
         return dict(
-            object_points=X[chosen] if isinstance(X, StoredRows) or X.ndim == 3 else X,
-            image_points=self.image_points[chosen],
+            object_points=X[cameras] if isinstance(X, StoredRows) or X.ndim == 3 else X,
+            image_points=self.image_points[cameras],
             image_size=tuple(self.image_size.ravel().tolist()),
-            visible=None if self.visible is None else self.visible[chosen],
+            visible=None if self.visible is None else self.visible[cameras],
         )
 
     def fingerprint(self, camera: int) -> str:
@@ -78,10 +78,12 @@ class CameraStack:
         X = self.object_points
         X = X[camera] if isinstance(X, StoredRows) or X.ndim == 3 else X
         xy = self.image_points[camera]
-        seen = ~np.isnan(xy).any(-1) & ~np.isnan(X).any(-1)
-        seen = seen if self.visible is None else seen & (self.visible[camera] != 0)
-        shown = seen.reshape(-1, len(X)).any(0)
-        return of_arrays(np.argwhere(seen), xy[seen], X[shown], np.array(self.image_size.tolist()))
+        is_seen = ~np.isnan(xy).any(-1) & ~np.isnan(X).any(-1)
+        is_seen = is_seen if self.visible is None else is_seen & (self.visible[camera] != 0)
+        is_point_seen = is_seen.reshape(-1, len(X)).any(0)
+        return of_arrays(
+            np.argwhere(is_seen), xy[is_seen], X[is_point_seen], np.array(self.image_size.tolist())
+        )
 
 
 def is_camera_stack(path: str | Path) -> bool:
@@ -98,10 +100,11 @@ def read_camera_stack(path: str | Path) -> CameraStack:
         raise InputError(f"{path}: no such file")
     with open_archive(path, EXPECTED, KNOWN_ARRAYS) as (archive, members):
         arrays = {name: _rows(path, archive, name, member) for name, member in members.items()}
-    missing = [name for name in REQUIRED_ARRAYS if name not in arrays]
-    if missing:
+    missing_arrays = [name for name in REQUIRED_ARRAYS if name not in arrays]
+    if missing_arrays:
         raise InputError(
-            f"{path}: no array {missing[0]!r}; expected {', '.join(REQUIRED_ARRAYS)} and, if "
+            f"{path}: no array {missing_arrays[0]!r}; expected {', '.join(REQUIRED_ARRAYS)} and, "
+            "if "
             "needed, visible and ids"
         )
     X, xy, size = (arrays[name] for name in REQUIRED_ARRAYS)
@@ -118,8 +121,8 @@ def read_camera_stack(path: str | Path) -> CameraStack:
             cameras, _ = check_rigs(X, xy, size, visible, cameras)
         else:
             X = X if isinstance(X, StoredRows) else single_list(X, xy)
-            every = np.broadcast_to(np.True_, xy.shape[:3])
-            check_shapes(X, xy, size, every if visible is None else visible)
+            all_visible = np.broadcast_to(np.True_, xy.shape[:3])
+            check_shapes(X, xy, size, all_visible if visible is None else visible)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     names = _names(path, arrays, "ids")
@@ -135,15 +138,15 @@ def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str) -> tup
     """An array of names, if there is one.
 
     **Raises:** `InputError` for another one."""
-    found = arrays.get(name)
-    if found is None:
+    array = arrays.get(name)
+    if array is None:
         return None
-    if found.ndim != 1:
-        raise InputError(f"{path}: {name} must be a list, but has the shape {found.shape}")
-    if found.dtype.kind not in "biufUS":
-        raise InputError(f"{path}: {name} must be texts or numbers, but are {found.dtype}")
+    if array.ndim != 1:
+        raise InputError(f"{path}: {name} must be a list, but has the shape {array.shape}")
+    if array.dtype.kind not in "biufUS":
+        raise InputError(f"{path}: {name} must be texts or numbers, but are {array.dtype}")
     # Bytes become the text they are in ASCII.
-    texts = np.char.decode(found, "ascii", "replace") if found.dtype.kind == "S" else found
+    texts = np.char.decode(array, "ascii", "replace") if array.dtype.kind == "S" else array
     return tuple(map(str, texts.tolist()))
 
 
@@ -152,7 +155,7 @@ def _rows(path: str | Path, archive: zipfile.ZipFile, name: str, member: Archive
     by_camera = len(member.shape) in BY_CAMERA.get(name, ())
     # A stack may exceed the memory: rows are read from the file when needed.
     if by_camera and (member.dtype.kind == "b") == (name == "visible"):
-        found = find_stored_rows(path, EXPECTED, archive, name, member)
-        if found is not None:
-            return found
+        stored_rows = find_stored_rows(path, EXPECTED, archive, name, member)
+        if stored_rows is not None:
+            return stored_rows
     return read_member(path, EXPECTED, archive, name, member)

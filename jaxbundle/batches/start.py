@@ -67,24 +67,24 @@ class StartSettings:
 def start_values(
     model: CameraModel,
     flat: bool,
-    known: bool,
-    seen: Sightings,
+    is_known: bool,
+    sightings: Sightings,
     interior: Float[Array, " parameters"],
     size: float,
     settings: StartSettings | None = None,
 ) -> tuple[Sightings, CameraUnknowns]:
-    """`seen` without the views that cannot be used, and start values.
+    """`sightings` without the views that cannot be used, and start values.
 
-    **Arguments:** `flat`: the object is a plane Z = 0; `known`: `interior` [parameters] is a
+    **Arguments:** `flat`: the object is a plane Z = 0; `is_known`: `interior` [parameters] is a
     camera to begin with, otherwise its focal lengths are sought; `size`: a length of the image.
     """
     settings = settings or StartSettings()
-    x, y, front = _ideal(model, known, seen, interior, settings.steepest)
-    fitted = Sightings(seen.point, seen.xy, seen.weight * front)
+    x, y, front = _ideal(model, is_known, sightings, interior, settings.steepest)
+    fitted = Sightings(sightings.point, sightings.xy, sightings.weight * front)
     columns, usable = _fit(fitted, x, y, 2 if flat else 3, settings)
-    weight = seen.weight * usable[:, None]
-    seen = Sightings(seen.point, seen.xy, weight)
-    if known:
+    weight = sightings.weight * usable[:, None]
+    sightings = Sightings(sightings.point, sightings.xy, weight)
+    if is_known:
         fx = fy = 1.0
     else:
         fx, fy = (_focal_of_flat if flat else _focal_of_solid)(columns, usable)
@@ -92,8 +92,8 @@ def start_values(
         fx = jnp.where(good(fx), fx, jnp.where(good(fy), fy, settings.ordinary_focal * size))
         fy = jnp.where(good(fy), fy, fx)
         names = model.principal_distance
-        given = (fx, fy) if len(names) == 2 else (0.5 * (fx + fy),)
-        for name, f in zip(names, given):
+        focal_lengths = (fx, fy) if len(names) == 2 else (0.5 * (fx + fy),)
+        for name, f in zip(names, focal_lengths):
             interior = interior.at[model.parameters.index(name)].set(f)
     # K⁻¹·H or K⁻¹·P; excluded views get the pose R = 1 at a distance, whose image exists
     a = [(c[0] / fx, c[1] / fy, c[2]) for c in columns]
@@ -103,23 +103,23 @@ def start_values(
         [jnp.where(usable, s * axes[j][i], s * (i == j)) for j in range(3)]
         for i, s in enumerate(FLIP)
     ]
-    far = (0.0, 0.0, -1.0)
-    t = jnp.stack([jnp.where(usable, s * c, f) for s, c, f in zip(FLIP, shift, far)], 1)
+    far_translation = (0.0, 0.0, -1.0)
+    t = jnp.stack([jnp.where(usable, s * c, f) for s, c, f in zip(FLIP, shift, far_translation)], 1)
     matrices = jnp.stack([jnp.stack(row, -1) for row in M], 1)
-    return seen, CameraUnknowns(interior, jax.vmap(quaternion_from_matrix)(matrices), t)
+    return sightings, CameraUnknowns(interior, jax.vmap(quaternion_from_matrix)(matrices), t)
 
 
 def _ideal(
     model: CameraModel,
-    known: bool,
-    seen: Sightings,
+    is_known: bool,
+    sightings: Sightings,
     interior: Float[Array, " parameters"],
     steepest: float,
 ) -> tuple[ByPoint, ByPoint, Bool[Array, "views points"]]:
     """Image points without distortion: directions if the camera is known, else pixels; and which
     have a plane coordinate (those of a fisheye far to the side have none)."""
-    u, v = seen.xy[..., 0], seen.xy[..., 1]
-    if known:
+    u, v = sightings.xy[..., 0], sightings.xy[..., 1]
+    if is_known:
         r, s, q = cameras.image_ray(model, tuple(interior), u, v)
         front = jnp.less(q, steepest)
         return jnp.where(front, -r / q, 0.0), jnp.where(front, s / q, 0.0), front
@@ -129,25 +129,27 @@ def _ideal(
 
 
 def _fit(
-    seen: Sightings, x: ByPoint, y: ByPoint, axes: int, settings: StartSettings
+    sightings: Sightings, x: ByPoint, y: ByPoint, axes: int, settings: StartSettings
 ) -> tuple[Sequence[Column], Bool[Array, " views"]]:
     """Columns (arrays of a view each) of H (2 axes) or P (3), w > 0 at the points; usable views."""
-    nil = jnp.zeros_like(seen.weight)
-    X, middle, size = _normalise(seen.weight, [seen.point[:, i] + nil for i in range(axes)])
+    nil = jnp.zeros_like(sightings.weight)
+    X, middle, size = _normalise(
+        sightings.weight, [sightings.point[:, i] + nil for i in range(axes)]
+    )
     wide = lambda c: jnp.max(jnp.abs(c), 1, keepdims=True) > settings.min_width
     X = [jnp.where(wide(c), c, 0.0) for c in X]
-    (x, y), (mx, my), k = _normalise(seen.weight, (x, y))
-    solution, usable = _direct_linear(seen.weight, X, x, y, settings.min_pivot)
+    (x, y), (mx, my), k = _normalise(sightings.weight, (x, y))
+    solution, usable = _direct_linear(sightings.weight, X, x, y, settings.min_pivot)
     h = [*solution, jnp.ones_like(mx)]
     # [(X − X̄)/size, 1] in the units of the object, then x = k·x̃ + mx
     columns = [[c / size for c in h[i :: axes + 1]] for i in range(axes)]
-    last = [
+    last_column = [
         c - sum(column[j] * m for column, m in zip(columns, middle))
         for j, c in enumerate(h[axes :: axes + 1])
     ]
-    columns = [(k * c[0] + mx * c[2], k * c[1] + my * c[2], c[2]) for c in (*columns, last)]
-    least = settings.min_points_flat if axes == 2 else settings.min_points_solid
-    return columns, usable & (jnp.sum(seen.weight, 1) >= least)
+    columns = [(k * c[0] + mx * c[2], k * c[1] + my * c[2], c[2]) for c in (*columns, last_column)]
+    min_points = settings.min_points_flat if axes == 2 else settings.min_points_solid
+    return columns, usable & (jnp.sum(sightings.weight, 1) >= min_points)
 
 
 def _normalise(
@@ -169,9 +171,9 @@ def _direct_linear(
     nil = jnp.zeros_like(weight)
     # x·(h₃ᵀX + 1) = h₁ᵀX, linear in H: its last element is 1, since after the reduction to the
     # centroids the points are in front of the camera
-    homogeneous, none = [*X, weight], [nil] * (len(X) + 1)
-    rows_x = [*homogeneous, *none, *(-x * c for c in X), x]
-    rows_y = [*none, *homogeneous, *(-y * c for c in X), y]
+    homogeneous, zeros = [*X, weight], [nil] * (len(X) + 1)
+    rows_x = [*homogeneous, *zeros, *(-x * c for c in X), x]
+    rows_y = [*zeros, *homogeneous, *(-y * c for c in X), y]
     n = len(rows_x) - 1
     N = rows_of(gram(rows_x, rows_y))
     scale = [1 / jnp.sqrt(N[i][i]) for i in range(n)]
@@ -207,8 +209,8 @@ def _focal_of_solid(
 
     def median(row: Column) -> Array:
         # The third row of P is that of R, so the rest of the first has the length f.
-        along = _dot(row, third)
-        f = _norm([a - along * b for a, b in zip(row, third)]) / length
+        component = _dot(row, third)
+        f = _norm([a - component * b for a, b in zip(row, third)]) / length
         return jnp.nanmedian(jnp.where(usable, f, jnp.nan))
 
     return median(rows[0]), median(rows[1])
@@ -217,9 +219,9 @@ def _focal_of_solid(
 def _pose_of_flat(columns: Sequence[Column]) -> tuple[tuple[Column, ...], list[ByView]]:
     """Columns of R, and t, from K⁻¹·H; the first two made perpendicular without preference."""
     size = 2 / (_norm(columns[0]) + _norm(columns[1]))
-    first, second = _perpendicular(_unit(columns[0]), _unit(columns[1]))
-    third: Any = cross(cast(Any, first), cast(Any, second))
-    return (first, second, third), [size * c for c in columns[2]]
+    axis_1, axis_2 = _perpendicular(_unit(columns[0]), _unit(columns[1]))
+    axis_3: Any = cross(cast(Any, axis_1), cast(Any, axis_2))
+    return (axis_1, axis_2, axis_3), [size * c for c in columns[2]]
 
 
 def _pose_of_solid(columns: Sequence[Column]) -> tuple[tuple[Column, ...], list[ByView]]:
@@ -227,9 +229,11 @@ def _pose_of_solid(columns: Sequence[Column]) -> tuple[tuple[Column, ...], list[
     rows = list(zip(*columns[:3]))
     size = 1 / _norm(rows[2])
     third = _unit(rows[2])
-    across = [_unit([a - _dot(row, third) * b for a, b in zip(row, third)]) for row in rows[:2]]
-    first, second = _perpendicular(*across)
-    return tuple(zip(first, second, third)), [size * c for c in columns[3]]
+    perpendicular = [
+        _unit([a - _dot(row, third) * b for a, b in zip(row, third)]) for row in rows[:2]
+    ]
+    axis_1, axis_2 = _perpendicular(*perpendicular)
+    return tuple(zip(axis_1, axis_2, third)), [size * c for c in columns[3]]
 
 
 def _perpendicular(a: Column, b: Column) -> tuple[list[ByView], list[ByView]]:

@@ -58,17 +58,17 @@ def weak_geometry(
     # Largest change of scale across half of a board that counts as seen from the front, and largest
     # difference between photographs that count as tilted alike: a tilt of 20° at a distance of five
     # boards makes 0.04.
-    straight = alike = 0.01
+    max_tilt = max_difference = 0.01
     centred = points - points.mean(0)
     axes, size = np.linalg.svd(centred)[2], np.linalg.svd(centred, compute_uv=False)
     if size[2] > 1e-6 * size[0]:
         return ""
     X = centred @ axes[:2].T / size[0] * np.sqrt(len(points))
     tilts, middles, extents = [], [], []
-    for view, seen in zip(xy, visible):
-        if seen.sum() < 6:  # four points determine a homography, two control it
+    for view, is_seen in zip(xy, visible):
+        if is_seen.sum() < 6:  # four points determine a homography, two control it
             continue
-        tilt, middle, extent = _find_tilt(X[seen], view[seen])
+        tilt, middle, extent = _find_tilt(X[is_seen], view[is_seen])
         tilts.append(tilt)
         middles.append(middle)
         extents.append(extent)
@@ -77,14 +77,14 @@ def weak_geometry(
     extent = np.median(extents)
     # The tilts about the middle of one view, in the same unit of length.
     tilts, middles = np.array(tilts) * (extent / np.array(extents))[:, None], np.array(middles)
-    if np.linalg.norm(tilts, axis=1).max() < straight:
+    if np.linalg.norm(tilts, axis=1).max() < max_tilt:
         return (
             "all photographs look straight at the board: a longer principal distance and a larger "
             "distance give the same images"
         )
     shift = (middles - middles[0]) / extent
     about_one = tilts / (1 - np.einsum("vi,vi->v", tilts, shift))[:, None]
-    if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < alike:
+    if np.linalg.norm(about_one - about_one.mean(0), axis=1).max() < max_difference:
         return (
             "all photographs show the board tilted alike, in the same direction of the image: one "
             "tilt does not separate the principal distance from the distance, nor the principal "

@@ -129,9 +129,9 @@ class BatchSettings:
         **Raises:** `InputError` for other ones."""
         for override in self.overrides:
             if re.split(r"[.=]", override)[0].strip() not in (*SECTIONS, SIGMA_IMAGE):
-                known = ", ".join((SIGMA_IMAGE, *(f"{name}.KEY" for name in SECTIONS)))
+                known_settings = ", ".join((SIGMA_IMAGE, *(f"{name}.KEY" for name in SECTIONS)))
                 raise InputError(
-                    f"--set {override}: of cameras and rigs {known} can be set; "
+                    f"--set {override}: of cameras and rigs {known_settings} can be set; "
                     "parameters are estimated by --free"
                 )
         document = apply_overrides({"project": {}, "camera": []}, self.overrides)
@@ -159,14 +159,14 @@ class BatchSettings:
 
     def of_cameras(self) -> dict:
         """Settings of the lines of cameras and rigs."""
-        found = {"model": self.named, "free": list(free_parameters(self.model, self.free))}
-        found |= {**self.adjusting, **self._asked, "brief": self.brief, **self.sections()}
-        return found | ({} if self.pixel_size is None else {"pixel_size": self.pixel_size})
+        settings = {"model": self.named, "free": list(free_parameters(self.model, self.free))}
+        settings |= {**self.adjusting, **self._asked, "brief": self.brief, **self.sections()}
+        return settings | ({} if self.pixel_size is None else {"pixel_size": self.pixel_size})
 
     def of_networks(self) -> dict:
         """Settings of the lines of networks."""
-        found = {**self.adjusting, **self._asked}
-        return found | ({"set": list(self.overrides)} if self.overrides else {})
+        settings = {**self.adjusting, **self._asked}
+        return settings | ({"set": list(self.overrides)} if self.overrides else {})
 
     @property
     def _asked(self) -> dict:
@@ -180,9 +180,12 @@ class BatchSettings:
 
 
 def plan_works(
-    inputs: Mapping[str, str], file: str | os.PathLike, settings: BatchSettings, held: ExitStack
+    inputs: Mapping[str, str],
+    file: str | os.PathLike,
+    settings: BatchSettings,
+    open_resources: ExitStack,
 ) -> list[Work]:
-    """The work of all inputs by their names; what it needs open is `held`."""
+    """The work of all inputs by their names; what it needs open is `open_resources`."""
     works: dict[str, Work] = {}
     folders: dict[str, str] = {}
     for name, path in inputs.items():
@@ -195,19 +198,25 @@ def plan_works(
     if settings.board is not None and folders:
         # Corners are kept beside the results, except where these are no file (/dev/stdout).
         regular = os.path.isfile(file) or not os.path.exists(file)
-        kept = held.enter_context(KeptCorners(f"{file}.corners" if regular else ":memory:"))
+        kept_corners = open_resources.enter_context(
+            KeptCorners(f"{file}.corners" if regular else ":memory:")
+        )
         # The photographs of a folder are of one size.
-        of_folders = (filter(is_photograph, Path(one).rglob("*")) for one in folders.values())
-        some = [path for found in of_folders for path in islice(found, 1)]
+        of_folders = (filter(is_photograph, Path(folder).rglob("*")) for folder in folders.values())
+        some_photographs = [
+            path for photograph_folders in of_folders for path in islice(photograph_folders, 1)
+        ]
         # Bytes of a process that searches boards, before its first photograph (measured).
-        at_once = searches_at_once(some, settings.board, 280e6)
-        workers = held.enter_context(Workers(search_alone, at_once))
+        at_once = searches_at_once(some_photographs, settings.board, 280e6)
+        workers = open_resources.enter_context(Workers(search_alone, at_once))
         if settings.rig:
-            rigs = RigFolders(tuple(folders.values()), settings.board, kept, workers)
+            rigs = RigFolders(tuple(folders.values()), settings.board, kept_corners, workers)
             works["photographs"] = _photographed_rigs(rigs, tuple(folders), settings)
         else:
-            found = PhotographFolders(tuple(folders.values()), settings.board, kept, workers)
-            works["photographs"] = _detect(found, tuple(folders), settings)
+            photograph_folders = PhotographFolders(
+                tuple(folders.values()), settings.board, kept_corners, workers
+            )
+            works["photographs"] = _detect(photograph_folders, tuple(folders), settings)
     return [*works.values()]
 
 
@@ -215,17 +224,17 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
     brief = settings.brief
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
 
-    def cameras(chosen: Sequence[int], _: ShareDone) -> list[dict]:
+    def cameras(rows: Sequence[int], _: ShareDone) -> list[dict]:
         batch = calibrate_batch(
-            **stack.arguments(np.asarray(chosen)),
+            **stack.arguments(np.asarray(rows)),
             model=settings.model,
             free=settings.free,
             **settings.of_batch,
         )
-        return [batch.row(i, brief) for i in range(len(chosen))]
+        return [batch.row(i, brief) for i in range(len(rows))]
 
-    def rigs(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
-        return [shorten(row, brief) for row, _ in solve_rigs(stack.rigs(chosen), of_rigs, tell)]
+    def rigs(rows: Sequence[int], tell: ShareDone) -> list[dict]:
+        return [shorten(row, brief) for row, _ in solve_rigs(stack.rigs(rows), of_rigs, tell)]
 
     if settings.are_plain() and not stack.of_rigs:
         return Work(keys, settings.of_cameras(), stack.fingerprint, cameras)
@@ -233,24 +242,30 @@ def _stack(stack: CameraStack, name: str, settings: BatchSettings) -> Work:
     return Work(keys, settings.of_cameras(), stack.fingerprint, rigs, portion=RIGS_A_WRITE)
 
 
-def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
+def _detect(
+    photograph_folders: PhotographFolders, keys: tuple[str, ...], settings: BatchSettings
+) -> Work:
     brief, plain = settings.brief, settings.are_plain()
     of_rigs = None if plain else settings.as_rigs()
     options = {"model": settings.model, "free": settings.free, **settings.of_batch}
 
     def solve(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
-        measured = found.measure(chosen, tell)
+        measured = photograph_folders.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}
             for i, why in measured.items()
             if isinstance(why, str)
         }
-        views = {i: one for i, one in measured.items() if not isinstance(one, str)}
+        views = {
+            i: views_of_camera
+            for i, views_of_camera in measured.items()
+            if not isinstance(views_of_camera, str)
+        }
         if of_rigs is None:
             for i, batch, place in calibrate_views(views, options):
                 rows[i] = batch.row(place, brief, len(views[i]))
         else:
-            rigs = [rig_of_views({"cam": one}) for one in views.values()]
+            rigs = [rig_of_views({"cam": views_of_camera}) for views_of_camera in views.values()]
             solved = solve_rigs(rigs, of_rigs)
             rows |= {i: shorten(row, brief) for i, (row, _) in zip(views, solved)}
         for i in views:
@@ -258,29 +273,39 @@ def _detect(found: PhotographFolders, keys: tuple[str, ...], settings: BatchSett
         return [rows[i] for i in chosen]
 
     # The board is a setting of the lines: other corners are found with another one.
-    lines = settings.of_cameras() | {"board": repr(found.board)}
+    lines = settings.of_cameras() | {"board": repr(photograph_folders.board)}
     portion = sys.maxsize if plain else RIGS_A_WRITE
-    return Work(keys, lines, found.fingerprint, solve, "its photographs", portion=portion)
+    return Work(
+        keys, lines, photograph_folders.fingerprint, solve, "its photographs", portion=portion
+    )
 
 
-def _photographed_rigs(found: RigFolders, keys: tuple[str, ...], settings: BatchSettings) -> Work:
+def _photographed_rigs(
+    rig_folders: RigFolders, keys: tuple[str, ...], settings: BatchSettings
+) -> Work:
     of_rigs = settings.as_rigs()
 
     def solve(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
-        measured = found.measure(chosen, tell)
+        measured = rig_folders.measure(chosen, tell)
         rows = {
             i: {"status": "bad input", "error": why}
             for i, why in measured.items()
             if isinstance(why, str)
         }
-        rigs = {i: one for i, one in measured.items() if not isinstance(one, str)}
+        rigs = {
+            i: rig_and_entries
+            for i, rig_and_entries in measured.items()
+            if not isinstance(rig_and_entries, str)
+        }
         solved = solve_rigs([rig for rig, _ in rigs.values()], of_rigs)
-        for (i, (_, told)), (row, _) in zip(rigs.items(), solved):
-            rows[i] = shorten(row, settings.brief) | told
+        for (i, (_, entries)), (row, _) in zip(rigs.items(), solved):
+            rows[i] = shorten(row, settings.brief) | entries
         return [rows[i] for i in chosen]
 
-    lines = settings.of_cameras() | {"board": repr(found.board)}
-    return Work(keys, lines, found.fingerprint, solve, "its photographs", portion=RIGS_A_WRITE)
+    lines = settings.of_cameras() | {"board": repr(rig_folders.board)}
+    return Work(
+        keys, lines, rig_folders.fingerprint, solve, "its photographs", portion=RIGS_A_WRITE
+    )
 
 
 def shorten(row: dict, brief: bool) -> dict:
@@ -288,11 +313,19 @@ def shorten(row: dict, brief: bool) -> dict:
     if not brief or "images" not in row:
         return row
     cameras = {
-        id: {k: v for k, v in of.items() if k != "correlations"}
-        for id, of in row["cameras"].items()
+        id: {k: v for k, v in camera_or_table.items() if k != "correlations"}
+        for id, camera_or_table in row["cameras"].items()
     }
-    further = {name: of for name, of in row["further_unknowns"].items() if name != "velocity"}
-    row = row | {"cameras": cameras, "further_unknowns": further, "removed": len(row["removed"])}
+    further_unknowns = {
+        name: camera_or_table
+        for name, camera_or_table in row["further_unknowns"].items()
+        if name != "velocity"
+    }
+    row = row | {
+        "cameras": cameras,
+        "further_unknowns": further_unknowns,
+        "removed": len(row["removed"]),
+    }
     return {key: value for key, value in row.items() if key != "images"}
 
 

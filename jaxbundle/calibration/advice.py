@@ -79,25 +79,25 @@ def advice(
     points; `rms` of the residuals in pixels; `t` = |value|/σ by parameter of the `model`;
     `validation`: by halves of the photographs.
     """
-    found = [
+    warnings = [
         f"{name} is known only to {100 / max(t[name], 1e-9):.0f} %: the photographs do not "
         "determine the principal distance; they need varied tilts and distances"
         for name in model.principal_distance
         if t.get(name, np.inf) < VAGUE_RATIO
     ]
-    found += [*_geometry(position, rotation, middle, unit, settings), *_image(covered, settings)]
+    warnings += [*_geometry(position, rotation, middle, unit, settings), *_image(covered, settings)]
     if rms > settings.max_rms:
-        found.append(
+        warnings.append(
             f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a bent "
             "board (--board-sigma), or another camera model (--models)"
         )
     if validation is not None and validation.test > settings.max_test:
-        found.append(
+        warnings.append(
             f"the two halves of the photographs contradict each other (test {validation.test:.1f}, "
             "1 expected): the σ are too small; the camera may have changed (focus, zoom), or the "
             "model or the board does not fit (--model, --board-sigma)"
         )
-    return found
+    return warnings
 
 
 def suggest(
@@ -143,19 +143,19 @@ def tilts(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views
 def repeated(
     position: Float[np.ndarray, "views 3"],
     rotation: Float[np.ndarray, "views 3 3"],
-    away: Float[np.ndarray, " views"],
+    distance: Float[np.ndarray, " views"],
     min_move: float,
 ) -> Bool[np.ndarray, " views"]:
     """Which photographs have nearly the pose of an earlier one that has not."""
-    found = np.zeros(len(position), bool)
+    is_repeated = np.zeros(len(position), bool)
     for k in range(len(position)):
-        first = np.flatnonzero(~found[:k])
-        move = np.linalg.norm(position[first] - position[k], axis=1) / away[k]
+        earlier = np.flatnonzero(~is_repeated[:k])
+        move = np.linalg.norm(position[earlier] - position[k], axis=1) / distance[k]
         # Of a small rotation by a, trace(R) = 1 + 2·cos(a).
-        cosine = (np.einsum("nij,ij->n", rotation[first], rotation[k]) - 1) / 2
+        cosine = (np.einsum("nij,ij->n", rotation[earlier], rotation[k]) - 1) / 2
         turn = np.arccos(np.clip(cosine, -1, 1))
-        found[k] = (np.maximum(move, turn) < min_move).any()
-    return found
+        is_repeated[k] = (np.maximum(move, turn) < min_move).any()
+    return is_repeated
 
 
 def _geometry(
@@ -180,28 +180,30 @@ def _geometry(
             "20° to 45°, to the left, to the right, up and down"
         )
     turn = turns(rotation)
-    apart = np.abs(turn[:, None] - turn) % 180
-    if np.minimum(apart, 180 - apart).max() < settings.min_roll:
+    difference_of_roll = np.abs(turn[:, None] - turn) % 180
+    if np.minimum(difference_of_roll, 180 - difference_of_roll).max() < settings.min_roll:
         yield (
             "no photograph is rolled by 90° about the line of sight: only the tilts determine the "
             "principal point; take some with the camera rolled"
         )
-    away = np.linalg.norm(position - middle, axis=1)
-    if away.max() < settings.min_distance_ratio * away.min():
+    distance = np.linalg.norm(position - middle, axis=1)
+    if distance.max() < settings.min_distance_ratio * distance.min():
         yield (
-            f"all photographs are from nearly one distance ({away.min():.3g} to {away.max():.3g} "
+            f"all photographs are from nearly one distance ({distance.min():.3g} to "
+            f"{distance.max():.3g} "
             f"{unit}): take some nearer and some farther away"
         )
-    alike = repeated(position, rotation, away, settings.min_move).sum()
-    if alike > settings.max_alike * number:
+    number_repeated = repeated(position, rotation, distance, settings.min_move).sum()
+    if number_repeated > settings.max_alike * number:
         yield (
-            f"{alike} of {number} photographs repeat the pose of another: they are no further "
+            f"{number_repeated} of {number} photographs repeat the pose of another: they are no "
+            "further "
             "geometry, and halves of the photographs agree too well; take them from other places"
         )
 
 
 def _image(covered: Coverage, settings: AdviceSettings) -> Iterator[str]:
-    empty = [name for name, there in covered.corners.items() if not there]
+    empty = [name for name, is_covered in covered.corners.items() if not is_covered]
     if empty:
         corners = f"{', '.join(empty)} corner{'s' if len(empty) > 1 else ''}"
         yield (

@@ -39,12 +39,12 @@ class MissingAffinity:
         return bool((np.abs(self.values) > 4.0 * self.sigma).any())
 
     def __str__(self) -> str:
-        each = ", ".join(
+        values_in_words = ", ".join(
             f"{n} {b:.2g} ± {s:.1g}" for n, b, s in zip(self.names, self.values, self.sigma)
         )
         return (
             f"{' and '.join(self.names)} of the model are held, but the residuals require them "
-            f"({each}): points are displaced by up to {self.largest:.2f} px; non-square "
+            f"({values_in_words}): points are displaced by up to {self.largest:.2f} px; non-square "
             "pixels, or an affinity: free them (--free)"
         )
 
@@ -54,21 +54,21 @@ def find_missing_affinity(adjustment: Adjustment) -> MissingAffinity | None:
 
     **Arguments:** the adjustment of one camera, with `image_size` and `pixel_size`.
     """
-    given = adjustment.problem.network.cameras[0]
-    model = get_model(given.model)
-    known = () if is_own(model) else AFFINE
-    names = tuple(n for n in known if n in model.parameters and n not in given.free)
-    if not names or given.pixel_size is None or not adjustment.sigma0 > 0:
+    camera = adjustment.problem.network.cameras[0]
+    model = get_model(camera.model)
+    affine_names = () if is_own(model) else AFFINE
+    names = tuple(n for n in affine_names if n in model.parameters and n not in camera.free)
+    if not names or camera.pixel_size is None or not adjustment.sigma0 > 0:
         return None
     columns = tuple(model.parameters.index(name) for name in names)
-    found = linearise_image_points(adjustment.problem, adjustment.values, columns)
-    score, S = lagrange_multipliers(adjustment, found, found.by_columns)
+    linearised = linearise_image_points(adjustment.problem, adjustment.values, columns)
+    score, S = lagrange_multipliers(adjustment, linearised, linearised.by_columns)
     # S is the normal matrix of b after the elimination of all other unknowns (Schur): its inverse
     # is the cofactor matrix of b as if it had been estimated with them
     cofactor = np.linalg.inv(S)
     b = -cofactor @ score
     sigma = adjustment.sigma0 * np.sqrt(np.diagonal(cofactor))
     # Δx = b1·x̄ + b2·ȳ, largest in a corner
-    half = np.multiply(not_none(given.image_size), given.pixel_size) / 2
-    reach = [half[AFFINE.index(name)] for name in names]
-    return MissingAffinity(names, b, sigma, float(np.abs(b) @ reach / given.pixel_size[0]))
+    half_size = np.multiply(not_none(camera.image_size), camera.pixel_size) / 2
+    reach = [half_size[AFFINE.index(name)] for name in names]
+    return MissingAffinity(names, b, sigma, float(np.abs(b) @ reach / camera.pixel_size[0]))

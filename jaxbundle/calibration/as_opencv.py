@@ -32,9 +32,9 @@ class OpenCVCalibration(tuple):
     result: BatchCalibration
 
     def __new__(cls, values: Sequence[Any], result: BatchCalibration) -> "OpenCVCalibration":
-        made = super().__new__(cls, values)
-        made.result = result
-        return made
+        calibration = super().__new__(cls, values)
+        calibration.result = result
+        return calibration
 
     rms = property(lambda self: self[0])
     camera_matrix = property(lambda self: self[1])
@@ -64,8 +64,8 @@ class OpenCVCalibration(tuple):
         return int(self.result.redundancy[0])
 
     def __repr__(self) -> str:
-        shown = ", ".join(f"{name} ± {value:.3g}" for name, value in self.sigma.items())
-        return f"OpenCVCalibration(rms={self[0]:.4f} px, {shown})"
+        values_in_words = ", ".join(f"{name} ± {value:.3g}" for name, value in self.sigma.items())
+        return f"OpenCVCalibration(rms={self[0]:.4f} px, {values_in_words})"
 
 
 def calibrate_opencv(
@@ -96,8 +96,13 @@ def calibrate_opencv(
 
     **Raises:** `InputError` for arrays of other shapes; `NotSolvedError` without a solution.
     """
-    objects = [_view("object_points", k, one, 3) for k, one in enumerate(object_points)]
-    images = [_view("image_points", k, one, 2) for k, one in enumerate(image_points)]
+    objects = [
+        _view("object_points", k, points_of_view, 3)
+        for k, points_of_view in enumerate(object_points)
+    ]
+    images = [
+        _view("image_points", k, points_of_view, 2) for k, points_of_view in enumerate(image_points)
+    ]
     if not objects or len(objects) != len(images):
         raise InputError(
             f"{len(objects)} views of object_points and {len(images)} of image_points are given; "
@@ -119,26 +124,26 @@ def calibrate_opencv(
         if len({*rows.tolist()}) < len(rows):
             raise InputError(f"view {k}: an object point occurs twice")
         xy[0, k, rows] = x
-    found = calibrate_batch(points, xy, image_size, free=free, snooping=snooping)
-    if not found.solved[0]:
-        raise NotSolvedError(f"the camera is not determined: {found.status[0]}")
-    interior = dict(zip(get_model("opencv").parameters, found.interior[0].tolist()))
+    calibration = calibrate_batch(points, xy, image_size, free=free, snooping=snooping)
+    if not calibration.solved[0]:
+        raise NotSolvedError(f"the camera is not determined: {calibration.status[0]}")
+    interior = dict(zip(get_model("opencv").parameters, calibration.interior[0].tolist()))
     fx, fy, cx, cy = (interior[name] for name in INTERIOR)
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     coefficients = np.array([interior.get(name, 0.0) for name in COEFFICIENTS])
-    free_names = {*found.parameters}
-    last = max((i for i, n in enumerate(COEFFICIENTS) if n in free_names), default=0)
-    length = next(n for n in LENGTHS if n > last)
-    R, t = cv_pose(found.rotation[0], found.position[0])
-    rvecs = tuple(_rotation_vector(one)[:, None] for one in np.asarray(R))
-    tvecs = tuple(np.asarray(one)[:, None] for one in np.asarray(t))
+    free_names = {*calibration.parameters}
+    last_coefficient = max((i for i, n in enumerate(COEFFICIENTS) if n in free_names), default=0)
+    length = next(n for n in LENGTHS if n > last_coefficient)
+    R, t = cv_pose(calibration.rotation[0], calibration.position[0])
+    rvecs = tuple(_rotation_vector(points_of_view)[:, None] for points_of_view in np.asarray(R))
+    tvecs = tuple(np.asarray(points_of_view)[:, None] for points_of_view in np.asarray(t))
     return OpenCVCalibration(
-        (float(found.rms[0]), K, coefficients[None, :length], rvecs, tvecs), found
+        (float(calibration.rms[0]), K, coefficients[None, :length], rvecs, tvecs), calibration
     )
 
 
-def _view(name: str, k: int, given: Any, width: int) -> Float[np.ndarray, "n width"]:
-    array = numeric_array(f"{name}[{k}]", given, f"an array [n, {width}]").astype(float)
+def _view(name: str, k: int, points: Any, width: int) -> Float[np.ndarray, "n width"]:
+    array = numeric_array(f"{name}[{k}]", points, f"an array [n, {width}]").astype(float)
     if array.size and array.ndim > 1 and array.shape[-1] == width:
         return array.reshape(-1, width)
     raise InputError(f"{name}[{k}]: expected an array [n, {width}], got {list(array.shape)}")

@@ -132,9 +132,11 @@ class CalibrationBias:
             "camera": "another camera model (--models)",
             "board": "estimate the points of the board (--board-free)",
         }
-        what = f"as of the {smooth[0]}: {remedy[smooth[0]]}" if smooth else "of no smooth kind"
+        description = (
+            f"as of the {smooth[0]}: {remedy[smooth[0]]}" if smooth else "of no smooth kind"
+        )
         part = f", {100 * self.ratio:.0f} % of the residual variance" if self.ratio > 0 else ""
-        return f"the residuals contain a bias{part}, {what}"
+        return f"the residuals contain a bias{part}, {description}"
 
 
 def find_bias(
@@ -152,29 +154,29 @@ def find_bias(
     cells = cells_of_four(problem, *grids)
     if len(cells) < settings.min_cells or not adjustment.sigma0 > 0:
         return None
-    found = linearise_image_points(problem, adjustment.values)
-    t, A = _equations(adjustment, found, cells)
+    linearised = linearise_image_points(problem, adjustment.values)
+    t, A = _equations(adjustment, linearised, cells)
     # An orthonormal basis of what camera and board can move in all t: the projection needs no
     # normal equations, whose condition is the square of that of A. Columns to the length 1, since
     # k3 and f differ by ten powers of ten.
     U, size, _ = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), False)
     U = U[:, size > len(A) * np.finfo(float).eps * size[0]]
-    left, degrees = t - U @ (U.T @ t), len(t) - U.shape[1]
-    more = adjustment.redundancy - degrees
-    if degrees < settings.min_cells or more < 1:
+    remaining, degrees = t - U @ (U.T @ t), len(t) - U.shape[1]
+    further_redundancy = adjustment.redundancy - degrees
+    if degrees < settings.min_cells or further_redundancy < 1:
         return None
-    omega, of_cells = float(left @ left), slice(0, 2 * len(cells))
+    omega, of_cells = float(remaining @ remaining), slice(0, 2 * len(cells))
     # Each over the root of its redundancy number, so that its σ is 1; the median of |x| as σ; 1e-3:
     # a t that determines a parameter alone has the number 0 but for rounding.
     root = np.sqrt(np.clip(1 - np.sum(U**2, 1), 1e-3, None))
-    noise = float(np.median(np.abs(left / root)[of_cells])) / normal_quantile(0.75)
-    tests = {"cells": _f_test(adjustment.vtpv - omega, more, omega, degrees)}
+    noise = float(np.median(np.abs(remaining / root)[of_cells])) / normal_quantile(0.75)
+    tests = {"cells": _f_test(adjustment.vtpv - omega, further_redundancy, omega, degrees)}
     fields = {
         "camera": _image_fields(problem, settings.camera_degree),
-        "board": _board_fields(problem, found, settings),
+        "board": _board_fields(problem, linearised, settings),
     }
     for name, B in fields.items():
-        gain, q = _gain(adjustment, found, B, settings.min_remainder)
+        gain, q = _gain(adjustment, linearised, B, settings.min_remainder)
         r = adjustment.redundancy - q
         if q and r > 0:
             tests[name] = _f_test(gain, q, adjustment.vtpv - gain, r)
@@ -185,14 +187,14 @@ def find_bias(
     return CalibrationBias(len(cells), sigma * noise, sigma * adjustment.sigma0, tests)
 
 
-def _f_test(gain: float, q: int, rest: float, r: int) -> FTest:
-    F = (gain / q) / (rest / r)
+def _f_test(gain: float, q: int, remaining: float, r: int) -> FTest:
+    F = (gain / q) / (remaining / r)
     return FTest(float(F), (q, r), f_tail(max(float(F), 0.0), q, r))
 
 
 def _gain(
     adjustment: Adjustment,
-    found: LinearisedImagePoints,
+    linearised: LinearisedImagePoints,
     B: Float[np.ndarray, "n 2 k"],
     min_remainder: float,
 ) -> tuple[float, int]:
@@ -200,42 +202,49 @@ def _gain(
     B = B / np.maximum(np.sqrt((B**2).sum((0, 1))), 1e-300)
     # Along the eigenvectors of S the coefficients are independent; a small eigenvalue is a field of
     # which the unknowns, or the other fields, leave less than `min_remainder`.
-    score, S = lagrange_multipliers(adjustment, found, B)
+    score, S = lagrange_multipliers(adjustment, linearised, B)
     size, V = np.linalg.eigh(S)
     new = size > min_remainder
     return float(((V[:, new].T @ score) ** 2 / size[new]).sum()), int(new.sum())
 
 
-def _powers(xy: Float[np.ndarray, "n 2"], least: int, most: int) -> Float[np.ndarray, "n terms"]:
+def _powers(
+    xy: Float[np.ndarray, "n 2"], lowest_degree: int, highest_degree: int
+) -> Float[np.ndarray, "n terms"]:
     """Products of Legendre polynomials of x and y [n, 2], both scaled to −1 … 1, of all degrees
-    from `least` to `most`."""
+    from `lowest_degree` to `highest_degree`."""
     scaled = [2 * (a - a.min()) / max(np.ptp(a), 1e-300) - 1 for a in xy.T]
-    P, R = (np.polynomial.legendre.legvander(a, most) for a in scaled)
-    pairs = [(i, j) for i in range(most + 1) for j in range(most + 1) if least <= i + j <= most]
+    P, R = (np.polynomial.legendre.legvander(a, highest_degree) for a in scaled)
+    pairs = [
+        (i, j)
+        for i in range(highest_degree + 1)
+        for j in range(highest_degree + 1)
+        if lowest_degree <= i + j <= highest_degree
+    ]
     return np.stack([P[:, i] * R[:, j] for i, j in pairs], 1)
 
 
 def _image_fields(problem: NetworkProblem, degree: int) -> Float[np.ndarray, "n 2 k"]:
     """Smooth displacements in x and y over the image, divided by σ."""
     field = _powers(problem.image_coordinates(), 0, degree)
-    each = problem.image_weights[:, :, None] * field[:, None]
-    none = np.zeros_like(each[:, 0])
-    return np.stack([np.hstack([each[:, 0], none]), np.hstack([none, each[:, 1]])], 1)
+    weighted = problem.image_weights[:, :, None] * field[:, None]
+    zeros = np.zeros_like(weighted[:, 0])
+    return np.stack([np.hstack([weighted[:, 0], zeros]), np.hstack([zeros, weighted[:, 1]])], 1)
 
 
 def _board_fields(
-    problem: NetworkProblem, found: LinearisedImagePoints, settings: BiasSettings
+    problem: NetworkProblem, linearised: LinearisedImagePoints, settings: BiasSettings
 ) -> Float[np.ndarray, "n 2 k"]:
     """Image effects of smooth displacements of the board points, divided by σ."""
     XY = problem.network.points.position[problem.point, :2]
     plane = _powers(XY, 0, settings.plane_degree)
     height = _powers(XY, 2, settings.height_degree)  # a height and a tilt are those of the pose
-    of = found.slopes["point"]
+    slopes_of_points = linearised.slopes["point"]
     return np.concatenate(
         [
-            of[:, :, :1] * plane[:, None],
-            of[:, :, 1:2] * plane[:, None],
-            of[:, :, 2:] * height[:, None],
+            slopes_of_points[:, :, :1] * plane[:, None],
+            slopes_of_points[:, :, 1:2] * plane[:, None],
+            slopes_of_points[:, :, 2:] * height[:, None],
         ],
         2,
     )
@@ -243,40 +252,42 @@ def _board_fields(
 
 def cells_of_four(problem: NetworkProblem, *grids: tuple[int, int]) -> Int[np.ndarray, "cells 4"]:
     """The image points of every complete cell of 2 × 2 points of the boards, in all photographs."""
-    used = np.flatnonzero(used_rays(problem))
+    used_points = np.flatnonzero(used_rays(problem))
     sizes = [rows * columns for rows, columns in grids]
     place = np.full((len(problem.network.images), sum(sizes)), -1)
-    place[problem.image[used], problem.point[used]] = used
+    place[problem.image[used_points], problem.point[used_points]] = used_points
     cells = []
-    for (rows, columns), own in zip(grids, np.split(place, np.cumsum(sizes)[:-1], axis=1)):
+    for (rows, columns), rays_of_board in zip(
+        grids, np.split(place, np.cumsum(sizes)[:-1], axis=1)
+    ):
         # Cells share no corner, so that their t are independent; an odd last row or column is not
         # used.
-        whole = own.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
-        corners = [whole[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
+        even_part = rays_of_board.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
+        corners = [even_part[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
         cells.append(np.stack(corners, 1))
-    found = np.concatenate(cells)
-    return found[(found >= 0).all(1)]
+    all_cells = np.concatenate(cells)
+    return all_cells[(all_cells >= 0).all(1)]
 
 
 def _equations(
-    adjustment: Adjustment, found: LinearisedImagePoints, cells: Int[np.ndarray, "cells 4"]
+    adjustment: Adjustment, linearised: LinearisedImagePoints, cells: Int[np.ndarray, "cells 4"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m u"]]:
     """t of all cells, followed by the pseudo-observations, and their derivatives by the free
     parameters of camera and board."""
     problem = adjustment.problem
     (name,) = (table.name for table in problem.cameras)
-    cut = lambda x: x[cells].reshape(len(cells), 8, -1)
+    by_cell = lambda x: x[cells].reshape(len(cells), 8, -1)
     # The last left singular vectors of J [8, 6] span what no pose of the cell can move.
-    N = np.linalg.svd(cut(found.slopes["image"]))[0][:, :, 6:]
-    t = np.einsum("cek,cep->ckp", N, cut(found.v)).ravel()
-    of_camera = np.einsum("cek,cep->ckp", N, cut(found.slopes[name]))
+    N = np.linalg.svd(by_cell(linearised.slopes["image"]))[0][:, :, 6:]
+    t = np.einsum("cek,cep->ckp", N, by_cell(linearised.v)).ravel()
+    of_camera = np.einsum("cek,cep->ckp", N, by_cell(linearised.slopes[name]))
     # A free or weighted board: its coordinates are columns of A, too.
     free = problem.table("point").free.astype(bool)
     of_points = np.zeros((len(cells), 2, *free.shape))
     if free.any():
-        slope = found.slopes["point"][cells]
-        each = np.einsum("cqrk,cqrw->qckw", N.reshape(-1, 4, 2, 2), slope)
-        for corner, part in enumerate(each):
+        slope = linearised.slopes["point"][cells]
+        by_corner = np.einsum("cqrk,cqrw->qckw", N.reshape(-1, 4, 2, 2), slope)
+        for corner, part in enumerate(by_corner):
             of_points[np.arange(len(cells)), :, problem.point[cells[:, corner]]] = part
     flat = lambda x: x.reshape(len(t), -1)
     A = np.concatenate([flat(of_camera), flat(of_points)[:, free.ravel()]], 1)
@@ -292,8 +303,8 @@ def _equations(
             continue
         x, weight = v[kind], problem.weights(kind)
         column = columns[problem.observations_of(kind).rows[0]]
-        used = weight > 0
-        rows = np.zeros((int(used.sum()), A.shape[1]))
-        rows[np.arange(len(rows)), column[used]] = weight[used]
-        t, A = np.append(t, x[used]), np.concatenate([A, rows])
+        has_weight = weight > 0
+        rows = np.zeros((int(has_weight.sum()), A.shape[1]))
+        rows[np.arange(len(rows)), column[has_weight]] = weight[has_weight]
+        t, A = np.append(t, x[has_weight]), np.concatenate([A, rows])
     return t, A

@@ -109,7 +109,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     columns, rows = views.image_size
     # Held parameters need no prior.
     prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
-    made = Camera(
+    start_camera = Camera(
         camera,
         model,
         start.parameters,
@@ -120,7 +120,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     )
     network = board_network(
         start,
-        made,
+        start_camera,
         sigma_image,
         board_sigma=board_sigma,
         board_free=board_free,
@@ -130,10 +130,10 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     if views.board.diameters.any() and result.converged:
         # Twice: the shifts depend on the poses, and these change by the shifts, by a small part.
         for _ in range(2):
-            centred = _without_eccentricity(start, result, made)
+            centred = _without_eccentricity(start, result, start_camera)
             network = board_network(
                 dataclasses.replace(start, views=centred),
-                made,
+                start_camera,
                 sigma_image,
                 board_sigma=board_sigma,
                 board_free=board_free,
@@ -251,8 +251,8 @@ def _shifts(
     centres: Float[AnyArray, "points 3"],
     radius: Float[AnyArray, " points"],
 ) -> Float[Array, "views points 2"]:
-    up = jnp.array([0.0, 0.0, 1.0])
-    shift = lambda pose, X, r: rim_centre_shift(model, p, pose, X, up, r)
+    normal = jnp.array([0.0, 0.0, 1.0])
+    shift = lambda pose, X, r: rim_centre_shift(model, p, pose, X, normal, r)
     return jax.vmap(jax.vmap(shift, (None, 0, 0)), (0, None, None))(poses, centres, radius)
 
 
@@ -281,10 +281,10 @@ def _model(
         raise InputError("free: expected at least one parameter, and each only once")
     for parameter in free:
         if parameter not in model.parameters or parameter in model.never_free:
-            known = [p for p in model.parameters if p not in model.never_free]
+            known_parameters = [p for p in model.parameters if p not in model.never_free]
             raise InputError(
                 f"free: camera model {model.name!r} has no free parameter {parameter!r}; its "
-                f"parameters are {', '.join(known)}"
+                f"parameters are {', '.join(known_parameters)}"
             )
     return model, free
 
@@ -298,12 +298,12 @@ def _pair(pixel_size: Any) -> tuple[float, float] | None:
     return float(pair[0]), float(pair[1])
 
 
-def _check_given(model: CameraModel, given: Any) -> None:
-    if given is None:
+def _check_given(model: CameraModel, values: Any) -> None:
+    if values is None:
         return
-    if not isinstance(given, Mapping):
-        raise InputError(f"given must be like {{'fx': 900.0}}, but is {show(given)}")
-    for name, value in given.items():
+    if not isinstance(values, Mapping):
+        raise InputError(f"given must be like {{'fx': 900.0}}, but is {show(values)}")
+    for name, value in values.items():
         if name not in model.parameters:
             raise InputError(
                 f"given: camera model {model.name!r} has no parameter {name!r}; its parameters "

@@ -26,17 +26,17 @@ def calibrate_each(
             "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
             f"is {show(photographs)}"
         )
-    found = {}
-    for name, given in photographs.items():
+    calibrations = {}
+    for name, photographs_of_camera in photographs.items():
         tell = (
             progress
             if progress is None or len(photographs) == 1
             else lambda stage, *numbers, name=name: progress(f"{stage} of {name}", *numbers)
         )
         try:
-            found[name] = calibrate_one(name, given, tell)
+            calibrations[name] = calibrate_one(name, photographs_of_camera, tell)
         except (InputError, NotSolvedError) as error:
             if len(photographs) == 1:
                 raise
             raise type(error)(f"camera {name}: {error}") from None
-    return found
+    return calibrations

@@ -93,10 +93,10 @@ def file_name(name: str) -> str:
 def files_of(names: Sequence[str]) -> list[str]:
     """Files that a calibration of these cameras may write, figures as patterns."""
     # What may be replaced in a folder that is written again; anything else in it is somebody's.
-    found = [REPORT, PAGE, RESULT]
+    patterns = [REPORT, PAGE, RESULT]
     for name in map(file_name, names):
         place = "" if len(names) == 1 else f"{name}/"
-        found += [
+        patterns += [
             f"{place}{file}"
             for file in (
                 REPORT,
@@ -112,10 +112,10 @@ def files_of(names: Sequence[str]) -> list[str]:
         ]
     if len(names) > 1:
         # Names of a rig may be of cameras that see no board.
-        found += ["rig_*.toml", "rig_*.png"]
-        found += rig_files()
-        found += [f"{ADJUSTED}/{file}" for file in NETWORK_FILES]
-    return found
+        patterns += ["rig_*.toml", "rig_*.png"]
+        patterns += rig_files()
+        patterns += [f"{ADJUSTED}/{file}" for file in NETWORK_FILES]
+    return patterns
 
 
 def rig_files() -> list[str]:
@@ -193,7 +193,7 @@ def _write_foreign(network: Network, folder: Path, name: str, limits: Sequence[s
 
 
 def write_calibrations(
-    found: "Calibrations", folder: str | Path, plots: bool = True, force: bool = False
+    calibrations: "Calibrations", folder: str | Path, plots: bool = True, force: bool = False
 ) -> None:
     """Write one calibration into a folder, several into separate subfolders.
 
@@ -203,12 +203,12 @@ def write_calibrations(
     """
     if plots:
         need_matplotlib()
-    with replace_folder(folder, COMMAND, files_of([*found.cameras]), force) as new:
-        fill_calibrations(found, new, plots)
+    with replace_folder(folder, COMMAND, files_of([*calibrations.cameras]), force) as new:
+        fill_calibrations(calibrations, new, plots)
 
 
 def fill_calibrations(
-    found: "Calibrations",
+    calibrations: "Calibrations",
     folder: Path,
     plots: bool,
     origin: Origin = UNKNOWN,
@@ -217,32 +217,32 @@ def fill_calibrations(
 ) -> None:
     """Write a calibration into an existing folder; `origin` is for report and page, `choice` for
     the page."""
-    if len(found.cameras) == 1 and found.rig is None:
-        one = next(iter(found.cameras.values()))
-        return _fill(one, folder, plots, origin, choice, progress)
-    for name, one in found.cameras.items():
-        _fill(one, folder / file_name(name), plots, origin, progress=progress)
-    write_text(folder / REPORT, head_line(origin) + found.report())
-    write_text(folder / PAGE, compose_calibrations(found, origin))
-    write_text(folder / RESULT, json_text(calibrations_dict(found)))
-    if found.rig is not None:
-        for name in found.rig.names:
-            text = camera_text(found.rig.camera(name), found.rig.sigma[name])
+    if len(calibrations.cameras) == 1 and calibrations.rig is None:
+        calibration = next(iter(calibrations.cameras.values()))
+        return _fill(calibration, folder, plots, origin, choice, progress)
+    for name, calibration in calibrations.cameras.items():
+        _fill(calibration, folder / file_name(name), plots, origin, progress=progress)
+    write_text(folder / REPORT, head_line(origin) + calibrations.report())
+    write_text(folder / PAGE, compose_calibrations(calibrations, origin))
+    write_text(folder / RESULT, json_text(calibrations_dict(calibrations)))
+    if calibrations.rig is not None:
+        for name in calibrations.rig.names:
+            text = camera_text(calibrations.rig.camera(name), calibrations.rig.sigma[name])
             write_text(folder / f"rig_{file_name(name)}.toml", text)
-        fill_rig(found.rig.network(), folder / RIG)
-        views = network_of_views(found.rig)
+        fill_rig(calibrations.rig.network(), folder / RIG)
+        views = network_of_views(calibrations.rig)
         # A camera may have the name of this folder.
-        if views is not None and ADJUSTED not in map(file_name, found.cameras):
+        if views is not None and ADJUSTED not in map(file_name, calibrations.cameras):
             fill_project(views, folder / ADJUSTED)
         if plots:
-            save_rig_plots(found.rig, folder, progress)
+            save_rig_plots(calibrations.rig, folder, progress)
 
 
 def fill_rig(network: Network, folder: Path) -> None:
     """Write a rig for other programs: Kalibr, mrcal, and in pairs of cameras OpenCV and ROS. What a
     program cannot hold is fitted, or left out; both are said in `conversions.txt`."""
     folder.mkdir(exist_ok=True)
-    said = [IN_BOARD_UNITS]
+    conversion_lines = [IN_BOARD_UNITS]
     for kind, (name, _) in RIG_FILES.items():
         target, refused = TARGETS[kind], ""
         # As it is, else with the models that the format has, its best one first.
@@ -251,24 +251,26 @@ def fill_rig(network: Network, folder: Path) -> None:
                 fitted, costs = network, {}
                 if model is not None:
                     fitted, costs = convert_cameras(network, model)
-                lost = target.write(fitted, folder / name)
+                losses = target.write(fitted, folder / name)
             except InputError as error:
                 refused = refused or f"{name}: not written: {error}"
                 continue
-            said += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
+            conversion_lines += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
             # The mounting itself is in every format.
-            said += [f"{name}: not kept: {what}" for what in lost if what != Rigs.TABLE]
+            conversion_lines += [
+                f"{name}: not kept: {loss}" for loss in losses if loss != Rigs.TABLE
+            ]
             if target.parts is not None and len(network.cameras) > 2:
                 parts = (
                     part.relative_to(folder).as_posix()
                     for part in target.parts(network, folder / name)
                     if part.exists()
                 )
-                said.append(f"{name}: one for each pair of cameras: {', '.join(parts)}")
+                conversion_lines.append(f"{name}: one for each pair of cameras: {', '.join(parts)}")
             break
         else:
-            said.append(refused)
-    write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in said))
+            conversion_lines.append(refused)
+    write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in conversion_lines))
 
 
 def fill_comparison(
@@ -286,8 +288,8 @@ def fill_comparison(
                     None,
                     partial(choice.plot_difference, model),
                 )
-                for model, apart in choice.differences.items()
-                if apart is not None
+                for model, difference in choice.differences.items()
+                if difference is not None
             },
             progress,
         )
@@ -296,10 +298,10 @@ def fill_comparison(
 def save_plots(calibration: "Calibration", folder: Path, progress: Progress | None = None) -> None:
     """The figures of quality, and those of the adjustment."""
     # Drawn when needed: most of the time of a figure is matplotlib's.
-    near = float(np.median(calibration.distances))
+    median_distance = float(np.median(calibration.distances))
     drawings = {
         "coverage": ((7, 5.6), None, calibration.plot_coverage),
-        "uncertainty": ((7, 5.6), None, partial(calibration.plot_uncertainty, near)),
+        "uncertainty": ((7, 5.6), None, partial(calibration.plot_uncertainty, median_distance)),
         "uncertainty_far": ((7, 5.6), None, calibration.plot_uncertainty),
         "uncertainty_distance": ((6.5, 4.2), None, calibration.plot_uncertainty_over_distance),
     }

@@ -75,24 +75,28 @@ def mapping_error(
     **Arguments:** `grid`: columns and rows of the grid for the mean.
     """
     problem = adjustment.problem
-    column = [one.id for one in problem.network.cameras].index(camera)
-    given = problem.network.cameras[column]
+    column = [camera_of_network.id for camera_of_network in problem.network.cameras].index(camera)
+    adjusted_camera = problem.network.cameras[column]
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
-    model = get_model(given.model)
-    uv = grid_of(not_none(given.image_size), *grid).reshape(-1, 2)
-    xy = in_model_units(uv, model, given.image_size, given.pixel_size)
+    model = get_model(adjusted_camera.model)
+    uv = grid_of(not_none(adjusted_camera.image_size), *grid).reshape(-1, 2)
+    xy = in_model_units(uv, model, adjusted_camera.image_size, adjusted_camera.pixel_size)
     xy = xy[have_rays(model, p, xy)]
-    whole = MappingError(_weights(_form(given, p, names, xy, "rotation"), C), len(xy) / len(uv))
+    error_of_image = MappingError(
+        _weights(_form(adjusted_camera, p, names, xy, "rotation"), C), len(xy) / len(uv)
+    )
     # "measured": up to the farthest point from the distortion's centre, since distortion is radial
     farthest = adjustment.farthest_measurements[column]
-    away = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
-    near = xy[away <= farthest]
+    distance = np.linalg.norm(xy - np.asarray(measured_centre(model, p)), axis=1)
+    within_reach = xy[distance <= farthest]
     # Two points determine the rotation: three angles from two coordinates each.
-    if len(near) < 2 or len(near) == len(xy):
-        return whole
-    part = _weights(_form(given, p, names, near, "rotation"), C)
-    return dataclasses.replace(whole, measured=MappingError(part, len(near) / len(uv)))
+    if len(within_reach) < 2 or len(within_reach) == len(xy):
+        return error_of_image
+    part = _weights(_form(adjusted_camera, p, names, within_reach, "rotation"), C)
+    return dataclasses.replace(
+        error_of_image, measured=MappingError(part, len(within_reach) / len(uv))
+    )
 
 
 def _weights(H: Float[np.ndarray, "k k"], C: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:

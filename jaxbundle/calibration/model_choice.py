@@ -118,50 +118,60 @@ class ModelComparison(TableMethods):
         self.candidates: tuple[Candidate, ...] = tuple(candidates)
         self.failed: dict[str, str] = dict(failed)
         self.folds, self.views, self.gross = folds, tuple(views), tuple(gross)
-        self.best = min(self.candidates, key=lambda one: one.left_out)
+        self.best = min(self.candidates, key=lambda candidate: candidate.left_out)
         # One standard error (Breiman et al.): between models that the scatter of the photographs
         # cannot separate, the simpler one.
-        enough = [one for one in self.candidates if self.excess(one)[0] <= self.excess(one)[1]]
-        self.suffices = min(enough, key=lambda one: (one.free, one.left_out))
+        sufficient = [
+            candidate
+            for candidate in self.candidates
+            if self.excess(candidate)[0] <= self.excess(candidate)[1]
+        ]
+        self.suffices = min(sufficient, key=lambda candidate: (candidate.free, candidate.left_out))
 
-    def excess(self, one: Candidate) -> tuple[float, float]:
+    def excess(self, candidate: Candidate) -> tuple[float, float]:
         """The excess of the mean square residual of left-out views over that of the best model, and
         its standard error over the views, pixels²."""
-        d = one.by_view - self.best.by_view
+        d = candidate.by_view - self.best.by_view
         return float(d.mean()), float(d.std(ddof=1) / np.sqrt(len(d)))
 
     @cached_property
     def differences(self) -> dict[str, ModelDifference | None]:
-        others = (one for one in self.candidates if one is not self.best)
-        return {one.model: _difference(self.best, one) for one in others}
+        other_candidates = (
+            candidate for candidate in self.candidates if candidate is not self.best
+        )
+        return {
+            candidate.model: _difference(self.best, candidate) for candidate in other_candidates
+        }
 
     @property
     def sentence(self) -> str:
         """The sufficient model and the reason."""
-        chosen, best = self.suffices, self.best
+        sufficient, best = self.suffices, self.best
         text = (
-            f"{chosen.model} suffices: in photographs left out it leaves an RMS of "
-            f"{chosen.left_out:.4g} px with {chosen.free} parameters"
+            f"{sufficient.model} suffices: in photographs left out it leaves an RMS of "
+            f"{sufficient.left_out:.4g} px with {sufficient.free} parameters"
         )
-        if chosen is best:
+        if sufficient is best:
             text += ", the least of all"
         else:
             text += (
                 f", no worse than {best.model} ({best.left_out:.4g} px, {best.free} parameters) "
                 "within the scatter of the photographs"
             )
-        simpler = [one for one in self.candidates if one.free < chosen.free]
+        simpler = [candidate for candidate in self.candidates if candidate.free < sufficient.free]
         if simpler:
-            worse = ", ".join(f"{one.model} ({one.left_out:.4g} px)" for one in simpler)
+            worse = ", ".join(
+                f"{candidate.model} ({candidate.left_out:.4g} px)" for candidate in simpler
+            )
             text += f"; {worse} {'is' if len(simpler) == 1 else 'are'} simpler and worse"
         return text + "."
 
     def plot_difference(self, model: str, ax: "Axes | None" = None) -> "Axes":
         """The map of a model's difference from the best; matplotlib axes."""
-        found = self.differences[model]
-        if found is None:
+        difference = self.differences[model]
+        if difference is None:
             raise ValueError(f"{model} and {self.best.model} have no part of the image in common")
-        return plotting.difference_map(found.comparison, ax, f"{model} − {self.best.model}")
+        return plotting.difference_map(difference.comparison, ax, f"{model} − {self.best.model}")
 
     def report(self) -> str:
         """Table and sentence as text."""
@@ -178,7 +188,10 @@ class ModelComparison(TableMethods):
     def table(self) -> dict[str, np.ndarray]:
         """One row a model: columns model, free, sigma0, rms, left_out (pixels), aic, bic."""
         names = ("model", "free", "sigma0", "rms", "left_out", "aic", "bic")
-        return {name: np.array([getattr(one, name) for one in self.candidates]) for name in names}
+        return {
+            name: np.array([getattr(candidate, name) for candidate in self.candidates])
+            for name in names
+        }
 
     def __str__(self) -> str:
         return self.report()
@@ -211,51 +224,53 @@ def compare_models(
     folds = integer("folds", folds, 2)
     names = [check_model(model).name for model in models]
     views = views_of(photographs, board, progress)
-    found, failed = _calibrate_all(views, dict(zip(names, models)), options)
-    if not found:
+    calibrations, failures = _calibrate_all(views, dict(zip(names, models)), options)
+    if not calibrations:
         raise NotSolvedError(
             "not solved: none of the models: "
-            + "; ".join(f"{name}: {why}" for name, why in failed.items())
+            + "; ".join(f"{name}: {why}" for name, why in failures.items())
         )
     # Models are compared on the same observations: a photograph, or a point, that one of them could
     # not use would make its residuals smaller. A point is gross if no model explains it.
-    together = set.intersection(*({*one.views.names} for one in found.values()))
-    common = [name for name in views.names if name in together]
+    names_in_all = set.intersection(
+        *({*calibration.views.names} for calibration in calibrations.values())
+    )
+    common = [name for name in views.names if name in names_in_all]
     needed = folds + 4  # so that about four remain for the camera of a fold
     if len(common) < needed:
         raise InputError(
             f"{len(common)} photographs can be used by all models; {folds} folds need "
             f"{needed} at least: give more, or fewer folds"
         )
-    gross = set.intersection(*map(_removed_points, found.values()))
+    gross = set.intersection(*map(_removed_points, calibrations.values()))
     candidates = []
-    for name, one in found.items():
-        candidate = _candidate(name, one, common, gross, folds)
+    for name, calibration in calibrations.items():
+        candidate = _candidate(name, calibration, common, gross, folds)
         if isinstance(candidate, str):
-            failed[name] = candidate
+            failures[name] = candidate
         else:
             candidates.append(candidate)
     if not candidates:
-        raise NotSolvedError(f"not solved: {'; '.join(failed.values())}")
-    return ModelComparison(candidates, failed, folds, common, sorted(gross))
+        raise NotSolvedError(f"not solved: {'; '.join(failures.values())}")
+    return ModelComparison(candidates, failures, folds, common, sorted(gross))
 
 
 def _calibrate_all(
     views: BoardViews, models: Mapping[str, str | CameraModel], options: Mapping[str, Any]
 ) -> tuple[dict[str, Calibration], dict[str, str]]:
     """The calibrations by the names of the models, and why others failed."""
-    found, failed = {}, {}
+    calibrations, failures = {}, {}
     for name, model in models.items():
         try:
             calibration = calibrate(views, model=model, cross_validation=False, **options)
         except (InputError, NotSolvedError) as error:
-            failed[name] = str(error)
+            failures[name] = str(error)
             continue
         if calibration.converged:
-            found[name] = calibration
+            calibrations[name] = calibration
         else:
-            failed[name] = f"not solved: {calibration.adjustment.termination}"
-    return found, failed
+            failures[name] = f"not solved: {calibration.adjustment.termination}"
+    return calibrations, failures
 
 
 def _removed_points(calibration: Calibration) -> set[tuple[str, str]]:
@@ -284,23 +299,26 @@ def _candidate(
     network = start_at_result(network, result, keep)
     network = take_images(network, np.isin(np.array(network.images.id, object), common))
     camera = network.cameras[0]
-    again = adjust(network)
-    if not again.converged:
-        return f"{name}: all observations together: {again.termination}"
+    readjusted = adjust(network)
+    if not readjusted.converged:
+        return f"{name}: all observations together: {readjusted.termination}"
     squares = np.zeros(len(network.observations))
     # Every fold-th view, not a block: neighbouring photographs are alike, and a block would leave a
     # part of the poses out.
     turns = np.arange(len(network.images)) % folds
     for fold in range(folds):
-        left = turns[network.observations.image] == fold
-        one = adjust(_without_weight(network, left))
-        if not one.converged:
-            return f"{name}: the photographs without those of fold {fold + 1}: {one.termination}"
-        squares[left] = _squares(one, camera)[left]
+        is_left_out = turns[network.observations.image] == fold
+        without_fold = adjust(_without_weight(network, is_left_out))
+        if not without_fold.converged:
+            return (
+                f"{name}: the photographs without those of fold {fold + 1}: "
+                f"{without_fold.termination}"
+            )
+        squares[is_left_out] = _squares(without_fold, camera)[is_left_out]
     # v is over σ, and the redundancy that of the image coordinates alone: k counts an unknown with
     # a prior by the part that the image determines
-    v = again.inspection.image_residuals
-    redundancy = float(again.problem.image_points(again.reliability.redundancy).sum())
+    v = readjusted.inspection.image_residuals
+    redundancy = float(readjusted.problem.image_points(readjusted.reliability.redundancy).sum())
     n, S = v.size, float(np.square(v).sum())
     k = n - redundancy
     sums, counts = (np.bincount(network.observations.image, w) for w in (squares, None))
@@ -310,7 +328,7 @@ def _candidate(
         len(camera.free),
         k,
         float(np.sqrt(S / redundancy)),
-        float(np.sqrt(_squares(again, camera).mean())),
+        float(np.sqrt(_squares(readjusted, camera).mean())),
         float(np.sqrt(squares.mean())),
         sums / counts,
         # σ is estimated, so that −2·ln of the likelihood is n·ln(S/n) and a constant
@@ -319,12 +337,12 @@ def _candidate(
     )
 
 
-def _without_weight(network: Network, left: Bool[np.ndarray, " rays"]) -> Network:
+def _without_weight(network: Network, is_left_out: Bool[np.ndarray, " rays"]) -> Network:
     """The network with negligible weight for some rays, which then do not affect the camera.
 
     A millionth of the weight: large enough for the poses, small enough for the camera."""
     rays = network.observations
-    sigma = np.where(left[:, None], 1e3 * rays.sigma, rays.sigma)
+    sigma = np.where(is_left_out[:, None], 1e3 * rays.sigma, rays.sigma)
     return network.replace(observations=dataclasses.replace(rays, sigma=sigma))
 
 
@@ -333,16 +351,16 @@ def _squares(adjustment: Adjustment, camera: Camera) -> Float[np.ndarray, " rays
     return np.square(residuals_in_pixels(adjustment, camera)[0]).sum(1)
 
 
-def _difference(best: Candidate, one: Candidate) -> ModelDifference | None:
+def _difference(best: Candidate, candidate: Candidate) -> ModelDifference | None:
     camera = best.calibration.camera
     sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
-    mappings = best.model_and_parameters, one.model_and_parameters
+    mappings = best.model_and_parameters, candidate.model_and_parameters
     try:
         comparison = compare_cameras(*mappings, **sizes)
     except ValueError:
         return None
     covariance = lambda c: c.calibration.adjustment.camera_covariance(c.calibration.name)
-    covariances = covariance(best), covariance(one)
+    covariances = covariance(best), covariance(candidate)
     C = expected_difference(comparison, *mappings, covariances, **sizes)
     size = unit_size(mappings[0][0], camera.pixel_size)[0]
     # Lengths over the σ of a length: √ of the trace.

@@ -41,19 +41,21 @@ def linearise_image_points(
     **Arguments:** `columns`: parameters of the camera, held or not, for derivatives.
     """
     camera = problem.network.cameras[0].model
-    of, declared = ImagePoint(camera, problem.network.residuals), problem.declared
+    image_point, declared = ImagePoint(camera, problem.network.residuals), problem.declared
     (name,) = (table.name for table in problem.cameras)
-    at = {"image": problem.image, name: problem.camera, "point": problem.point}
-    touched = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i], values[t]) for t, i in at.items())
-    spaces = tuple(declared.spaces[t] for t in at)
+    rows_of = {"image": problem.image, name: problem.camera, "point": problem.point}
+    touched_values = tuple(
+        jax.tree.map(lambda x, i=i: np.asarray(x)[i], values[t]) for t, i in rows_of.items()
+    )
+    spaces = tuple(declared.spaces[t] for t in rows_of)
     xy, weight = problem.image_coordinates(), problem.image_weights
-    v, J = _linearise(of, spaces, columns, touched, xy, weight)
+    v, J = _linearise(image_point, spaces, columns, touched_values, xy, weight)
     *parts, B = np.split(np.asarray(J), np.cumsum([s.width for s in spaces]), 2)
-    return LinearisedImagePoints(np.asarray(v), dict(zip(at, parts)), at, B)
+    return LinearisedImagePoints(np.asarray(v), dict(zip(rows_of, parts)), rows_of, B)
 
 
 def lagrange_multipliers(
-    adjustment: Adjustment, found: LinearisedImagePoints, B: Float[np.ndarray, "n 2 k"]
+    adjustment: Adjustment, linearised: LinearisedImagePoints, B: Float[np.ndarray, "n 2 k"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     """Bᵀv and S of omitted parameters b, B = ∂v/∂b:
 
@@ -66,22 +68,22 @@ def lagrange_multipliers(
     """
     tables, k = adjustment.problem.tables, B.shape[2]
     rows = {t.name: np.zeros((k, t.rows, t.space.width)) for t in tables}
-    for t, i in found.touched.items():
-        part = np.einsum("nrw,nrk->nkw", found.slopes[t], B)
+    for t, i in linearised.touched.items():
+        part = np.einsum("nrw,nrk->nkw", linearised.slopes[t], B)
         np.add.at(rows[t].swapaxes(0, 1), i, part)
     flat = B.reshape(-1, k)
     # (JᵀB)ᵀ·Q·(JᵀB) by the factor that the adjustment holds: Q itself, thousands squared, is never
     # made
     S = flat.T @ flat - adjustment.inspection.solution.propagate_rows(rows)
-    return flat.T @ found.v.ravel(), S
+    return flat.T @ linearised.v.ravel(), S
 
 
 @partial(compile_once, static=(0, 1, 2))
 def _linearise(
-    of: ImagePoint,
+    image_point: ImagePoint,
     spaces: tuple[Space, ...],
     columns: tuple[int, ...],
-    touched: tuple[Any, ...],
+    touched_values: tuple[Any, ...],
     xy: Float[AnyArray, "n 2"],
     weight: Float[AnyArray, "n 2"],
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 directions"]]:
@@ -90,20 +92,20 @@ def _linearise(
     ends = np.cumsum([s.width for s in spaces])
 
     def linearise_point(
-        touched: tuple[Any, ...], xy: Float[AnyArray, "2"], weight: Float[AnyArray, "2"]
+        touched_values: tuple[Any, ...], xy: Float[AnyArray, "2"], weight: Float[AnyArray, "2"]
     ) -> tuple[Array, Array]:
         def v(change: Float[Array, " directions"]) -> tuple[Array, Array]:
             *changes, b = jnp.split(change, ends)
             pose, interior, ray = (
-                s.move(s.prepare(x), tuple(d)) for s, x, d in zip(spaces, touched, changes)
+                s.move(s.prepare(x), tuple(d)) for s, x, d in zip(spaces, touched_values, changes)
             )
             p = dict(enumerate(interior)) | {c: interior[c] + b[k] for k, c in enumerate(columns)}
-            residual = jnp.stack(of(pose, tuple(p.values()), tuple(ray), tuple(xy)))
+            residual = jnp.stack(image_point(pose, tuple(p.values()), tuple(ray), tuple(xy)))
             # Returned twice: value and derivatives in one pass.
             residual = jnp.where(weight > 0, weight * residual, 0.0)
             return residual, residual
 
-        J, found = jax.jacfwd(v, has_aux=True)(jnp.zeros(ends[-1] + len(columns)))
-        return found, J
+        J, residual_value = jax.jacfwd(v, has_aux=True)(jnp.zeros(ends[-1] + len(columns)))
+        return residual_value, J
 
-    return jax.vmap(linearise_point)(touched, xy, weight)
+    return jax.vmap(linearise_point)(touched_values, xy, weight)

@@ -60,19 +60,18 @@ KIND = "calibration of cameras"
 
 
 def compose_calibrations(
-    found: "Calibrations",
+    calibrations: "Calibrations",
     origin: Origin = UNKNOWN,
     choice: "ModelComparison | None" = None,
     also: Addition = NO_ADDITION,
 ) -> Iterator[str]:
     """The page of one calibration, or the common page of several, with the rig.
 
-    **Arguments:** `found`: `Calibrations`; `choice`: the underlying comparison of models; `also`:
-    further findings and sections.
-    """
-    if len(found.cameras) == 1 and found.rig is None:
-        return compose_calibration(next(iter(found.cameras.values())), origin, choice, also)
-    return write(_describe_several(found, origin, also))
+    **Arguments:** `calibrations`: `Calibrations`; `choice`: the underlying comparison of models;
+    `also`: further findings and sections."""
+    if len(calibrations.cameras) == 1 and calibrations.rig is None:
+        return compose_calibration(next(iter(calibrations.cameras.values())), origin, choice, also)
+    return write(_describe_several(calibrations, origin, also))
 
 
 def compose_calibration(
@@ -83,8 +82,8 @@ def compose_calibration(
 ) -> Iterator[str]:
     """The page of one camera: that of its adjustment, and its accuracy; `also`: further findings
     and sections."""
-    own = _describe_one(calibration, choice).followed_by(also)
-    return compose(calibration.adjustment, origin, also=own)
+    addition_of_camera = _describe_one(calibration, choice).followed_by(also)
+    return compose(calibration.adjustment, origin, also=addition_of_camera)
 
 
 def _describe_one(calibration: "Calibration", choice: "ModelComparison | None" = None) -> Addition:
@@ -130,9 +129,9 @@ def _quality(
         grid(MAPS_HEADER, map_rows(maps, unit)),
     ]
     parts.append('<div class="maps">\n')
-    for one, (held, *_) in zip(maps, map_rows(maps, unit)):
-        caption = f"σ over the image from corner to corner, pixels; point held in {held}"
-        parts.append(figure(draw_field(one.sigma), caption))
+    for uncertainty, (frame, *_) in zip(maps, map_rows(maps, unit)):
+        caption = f"σ over the image from corner to corner, pixels; point held in {frame}"
+        parts.append(figure(draw_field(uncertainty.sigma), caption))
     parts.append("</div>\n")
     title = f"Quality of camera {name}" if name else "Quality"
     link = "Quality" if number == 0 else ""
@@ -143,14 +142,14 @@ def _validation(calibration: "Calibration") -> Section:
     """σ against distance, and the two halves of the photographs."""
     distances, middle, corners, reported = calibration.uncertainty_curves()
     # σ is 0 everywhere if the measurements fit exactly, and no number without a ray
-    known = [
+    curve_data = [
         (name, np.log10(distances[s > 0]), np.log10(s[s > 0]), kind)
         for name, s, kind in (
             ("middle of the image", middle, "first"),
             ("worst corner", corners, "second"),
         )
     ]
-    curves = [Curve(name, x, y, kind=kind) for name, x, y, kind in known if len(x)]
+    curves = [Curve(name, x, y, kind=kind) for name, x, y, kind in curve_data if len(x)]
     unit = _unit(calibration)
     if curves:
         drawing = draw_curves(
@@ -160,10 +159,10 @@ def _validation(calibration: "Calibration") -> Section:
             "xy",
             (float(np.log10(reported[0, 0])), "median distance of the board"),
         )
-        shown = figure(drawing, "Uncertainty against the distance of the point, in the scene")
+        content = figure(drawing, "Uncertainty against the distance of the point, in the scene")
     else:
-        shown = paragraph("The measurements fit exactly: σ of a projected point is 0.")
-    parts = [shown, "<h3>Cross-validation</h3>\n"]
+        content = paragraph("The measurements fit exactly: σ of a projected point is 0.")
+    parts = [content, "<h3>Cross-validation</h3>\n"]
     parts += [
         paragraph(words[:1].upper() + words[1:]) for words in cross_validation_in_words(calibration)
     ]
@@ -191,10 +190,10 @@ def _models(choice: "ModelComparison") -> Section:
     return Section("models", "Camera models compared", "".join(parts), "Models")
 
 
-def _describe_several(found: "Calibrations", origin: Origin, also: Addition) -> Page:
+def _describe_several(calibrations: "Calibrations", origin: Origin, also: Addition) -> Page:
     """The common page: the verdict, the rig, the parameters of all."""
-    sections, tables = [], {"cameras": _table_of_cameras(found)}
-    rig = found.rig
+    sections, tables = [], {"cameras": _table_of_cameras(calibrations)}
+    rig = calibrations.rig
     if rig is not None:
         unit = _unit(next(iter(rig.cameras.values())))
         sections += [_rig(rig, unit)]
@@ -205,14 +204,26 @@ def _describe_several(found: "Calibrations", origin: Origin, also: Addition) -> 
         listed = table_of_residuals(rig.residuals, rig.sigma0)
         tables["observations"] = Listing("Observations of the rig", listed, "result.json")
     else:
-        solved = {name: one for name, one in found.cameras.items() if one.converged}
-        for number, (name, one) in enumerate(solved.items()):
-            sections.append(_quality(one.coverage, one.reported_maps, _unit(one), name, number))
-    more = paragraph("Every camera has its own page in its folder of --out.")
-    title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
-    findings = [*conclude_calibrations(found).findings, *also.findings]
-    first = give_verdict(findings, (), more)
-    return Page(title, [first, *also.sections, *sections], origin, tables=tables)
+        solved = {
+            name: calibration
+            for name, calibration in calibrations.cameras.items()
+            if calibration.converged
+        }
+        for number, (name, calibration) in enumerate(solved.items()):
+            sections.append(
+                _quality(
+                    calibration.coverage,
+                    calibration.reported_maps,
+                    _unit(calibration),
+                    name,
+                    number,
+                )
+            )
+    remark = paragraph("Every camera has its own page in its folder of --out.")
+    title = f"{KIND.capitalize()} {', '.join(map(clean, calibrations.cameras))}"
+    findings = [*conclude_calibrations(calibrations).findings, *also.findings]
+    verdict_section = give_verdict(findings, (), remark)
+    return Page(title, [verdict_section, *also.sections, *sections], origin, tables=tables)
 
 
 def _rig(rig: "RigCalibration", unit: str) -> Section:
@@ -232,13 +243,13 @@ def _rig(rig: "RigCalibration", unit: str) -> Section:
     return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig")
 
 
-def _table_of_cameras(found: "Calibrations") -> Listing:
+def _table_of_cameras(calibrations: "Calibrations") -> Listing:
     """One row per parameter of every separately calibrated camera."""
     rows = [
-        (name, one.camera.model, parameter, value, one.stated_sigma.get(parameter))
-        for name, one in found.cameras.items()
-        if one.converged
-        for parameter, value in one.parameters.items()
+        (name, calibration.camera.model, parameter, value, calibration.stated_sigma.get(parameter))
+        for name, calibration in calibrations.cameras.items()
+        if calibration.converged
+        for parameter, value in calibration.parameters.items()
     ]
     camera, model, parameter, value, sigma = zip(*rows) if rows else ((),) * 5
     words = lambda values: np.array(values, dtype=object)

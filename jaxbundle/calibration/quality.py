@@ -113,33 +113,37 @@ def uncertainty_map(
     if not distance > 0:
         raise InputError(f"distance {distance:g}: expected a positive distance")
     network = adjustment.problem.network
-    c = [given.id for given in network.cameras].index(camera)
-    given = network.cameras[c]
-    if given.image_size is None:
+    c = [camera_of_network.id for camera_of_network in network.cameras].index(camera)
+    camera_of_network = network.cameras[c]
+    if camera_of_network.image_size is None:
         raise InputError(f"camera {camera!r}: image_size is needed for a map of its image")
-    model = get_model(given.model)
-    uv = grid_of(given.image_size, *grid)
-    xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
+    model = get_model(camera_of_network.model)
+    uv = grid_of(camera_of_network.image_size, *grid)
+    xy = in_model_units(
+        uv.reshape(-1, 2), model, camera_of_network.image_size, camera_of_network.pixel_size
+    )
     if frame == "scene":
         views = np.flatnonzero(network.images.camera == c)
         p = np.array(list(adjustment.camera_parameters(camera).values()))
-        there = np.flatnonzero(have_rays(model, p, xy))
+        places_with_rays = np.flatnonzero(have_rays(model, p, xy))
         # Fixed in the scene, a point moves with the pose of each view as well, and poses are
         # correlated with the camera: the whole covariance, by propagation through a function.
         table, row = adjustment.problem.table_of_camera(c)
         function = images_through_scene(
-            model, (table.name, row), views, adjustment.values, xy[there], distance
+            model, (table.name, row), views, adjustment.values, xy[places_with_rays], distance
         )
-        Q = adjustment.covariance_of(function).reshape(len(there), 2, len(there), 2)
-        n = np.arange(len(there))
+        Q = adjustment.covariance_of(function).reshape(
+            len(places_with_rays), 2, len(places_with_rays), 2
+        )
+        n = np.arange(len(places_with_rays))
         C = np.full((len(xy), 2, 2), np.nan)
-        C[there] = Q[n, :, n]
+        C[places_with_rays] = Q[n, :, n]
     else:
         names, Q = adjustment.camera_covariance(camera)
         columns = tuple(model.parameters.index(name) for name in names)
         p = np.array(list(adjustment.camera_parameters(camera).values()))
         C = interior_covariance_of_images(model, p, columns, Q, xy, frame)
-    per_unit = 1 / np.array(unit_size(model, given.pixel_size))
+    per_unit = 1 / np.array(unit_size(model, camera_of_network.pixel_size))
     C = C * per_unit[:, None] * per_unit
     return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
 
@@ -158,14 +162,21 @@ def over_distance(
     `maps` at three distances.
     """
     # Infinity is the point 0 of 1/d, and as good a node as any other.
-    near = np.array([1 / m.distance for m in maps])
+    nearness = np.array([1 / m.distance for m in maps])
     variance = np.array([_in_corners(m.sigma**2) for m in maps])
     middle = np.array([m.middle**2 for m in maps])
     t = 1 / np.asarray(distances, float)
     weight = np.array(
         [
-            np.prod([(t - other) / (own - other) for other in near if other != own], axis=0)
-            for own in near
+            np.prod(
+                [
+                    (t - other_nearness) / (own_nearness - other_nearness)
+                    for other_nearness in nearness
+                    if other_nearness != own_nearness
+                ],
+                axis=0,
+            )
+            for own_nearness in nearness
         ]
     )
     interpolate = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
@@ -213,11 +224,11 @@ def coverage(
         "lower left": counts[-top:, :left],
         "lower right": counts[-top:, -left:],
     }
-    away = np.linalg.norm(uv - (np.array(image_size) - 1) / 2, axis=1)
+    distance = np.linalg.norm(uv - (np.array(image_size) - 1) / 2, axis=1)
     return Coverage(
         counts.astype(int),
         {name: bool((c > 0).any()) for name, c in corners.items()},
-        float(away.max(initial=0.0) / (np.hypot(w, h) / 2)),
+        float(distance.max(initial=0.0) / (np.hypot(w, h) / 2)),
     )
 
 
@@ -263,26 +274,30 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
     # Every other photograph, so that both halves have poses from all around.
     turns = np.arange(len(network.images)) % 2
     try:
-        again = partial(adjust, robust=result.robust)
-        halves = [again(take_images(network, turns == half)) for half in (0, 1)]
+        adjust_again = partial(adjust, robust=result.robust)
+        halves = [adjust_again(take_images(network, turns == half)) for half in (0, 1)]
         if not all(half.converged for half in halves):
             return None
         name = network.cameras[0].id
         # Each half with the camera of the other, whose poses alone are estimated: the residuals
         # grow by what the camera does not know of unseen photographs.
-        own = [half.camera_parameters(name) for half in halves]
-        held = [
-            again(_with_fixed_camera(take_images(network, turns == 1 - half), own[half]))
+        parameters_of_halves = [half.camera_parameters(name) for half in halves]
+        cross_adjusted = [
+            adjust_again(
+                _with_fixed_camera(
+                    take_images(network, turns == 1 - half), parameters_of_halves[half]
+                )
+            )
             for half in (0, 1)
         ]
     except (InputError, NotSolvedError):
         return None
-    if not all(other.converged for other in held):
+    if not all(adjusted.converged for adjusted in cross_adjusted):
         return None
     # Independent halves: Σ(p₁ − p₂) = C₁ + C₂.
     names, C = halves[0].camera_covariance(name)
     C = C + halves[1].camera_covariance(name)[1]
-    d = np.array([own[0][n] - own[1][n] for n in names])
+    d = np.array([parameters_of_halves[0][n] - parameters_of_halves[1][n] for n in names])
     scale = np.sqrt(np.diagonal(C))
     test = squared_difference(d, C) / len(d)
     v = lambda half: residuals_in_pixels(half, half.problem.network.cameras[0])[0]
@@ -290,11 +305,11 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
     rms = lambda parts: float(np.sqrt(np.mean([rms_of(p) ** 2 for p in parts])))
     return CrossValidation(
         rms(halves),
-        rms(held),
+        rms(cross_adjusted),
         dict(zip(names, (d / scale).tolist())),
         test,
-        (own[0], own[1]),
-        _compare(network.cameras[0], own),
+        (parameters_of_halves[0], parameters_of_halves[1]),
+        _compare(network.cameras[0], parameters_of_halves),
     )
 
 
@@ -333,16 +348,16 @@ def take_images(network: Network, keep: Bool[np.ndarray, " images"]) -> Network:
     images, rays = network.images, network.observations
     index = np.cumsum(keep) - 1
     rays = rays.take(keep[rays.image])
-    chosen = np.flatnonzero(keep)
+    rows = np.flatnonzero(keep)
     return network.replace(
         images=dataclasses.replace(
             images,
-            id=tuple(images.id[i] for i in chosen),
-            camera=images.camera[chosen],
-            position=images.position[chosen],
-            angles=images.angles[chosen],
-            sigma=images.sigma[chosen],
-            source=images.source.take(chosen),
+            id=tuple(images.id[i] for i in rows),
+            camera=images.camera[rows],
+            position=images.position[rows],
+            angles=images.angles[rows],
+            sigma=images.sigma[rows],
+            source=images.source.take(rows),
         ),
         observations=dataclasses.replace(rays, image=index[rays.image]),
     )
@@ -361,12 +376,14 @@ def residuals_in_pixels(
     problem, model = adjustment.problem, get_model(camera.model)
     weight = problem.image_weights
     v = adjustment.inspection.image_residuals
-    used = used_rays(problem)
+    is_used = used_rays(problem)
     # v is over σ in the adjustment
-    v = np.where(used[:, None], v / np.where(used[:, None], weight, 1.0), np.nan)
-    c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
-    own = problem.camera == c
-    xy = problem.image_coordinates()[own]
+    v = np.where(is_used[:, None], v / np.where(is_used[:, None], weight, 1.0), np.nan)
+    c = [camera_of_network.id for camera_of_network in adjustment.problem.network.cameras].index(
+        camera.id
+    )
+    is_of_camera = problem.camera == c
+    xy = problem.image_coordinates()[is_of_camera]
     size = np.array(unit_size(model, camera.pixel_size))
     uv = in_pixels(xy, model, camera.image_size, camera.pixel_size)
-    return v[own] / size, uv
+    return v[is_of_camera] / size, uv

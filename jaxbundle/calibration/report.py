@@ -79,10 +79,10 @@ def photograph_facts(views: BoardViews) -> list[tuple[str, str]]:
     """The board, the number of photographs and of detected points."""
     size = " × ".join(map(str, views.image_size))
     boards = views.board.items if isinstance(views.board, BoardSet) else [("", views.board)]
-    used = len({*views.photographs})
+    number_used = len({*views.photographs})
     return [
         *((f"Board {clean(name)}".strip(), str(board)) for name, board in boards),
-        ("Photographs", f"{used} used, {len(views.failed)} not; {size} pixels"),
+        ("Photographs", f"{number_used} used, {len(views.failed)} not; {size} pixels"),
         ("Points", f"{int(views.visible.sum())} of {views.possible} image points found"),
         *(("Note", note) for note in views.notes),
     ]
@@ -100,20 +100,24 @@ def _camera(calibration: "Calibration") -> list[str]:
             rows.append((name, significant(value, DIGITS_WITHOUT_SIGMA), "held"))
     lines += table(("parameter", "value", "σ"), rows, "lrr")
     rms = calibration.rms
-    removed = len(calibration.adjustment.removed)
+    number_removed = len(calibration.adjustment.removed)
     # The first as OpenCV states it, the second to compare with σ of a coordinate.
     lines += ["", f"RMS of an image point {rms:.4f} px, of a coordinate {rms / np.sqrt(2):.4f} px"]
-    lines += [f"Removed as gross errors: {count(removed, 'image point')}"] if removed else []
+    lines += (
+        [f"Removed as gross errors: {count(number_removed, 'image point')}"]
+        if number_removed
+        else []
+    )
     return lines
 
 
 def _quality(calibration: "Calibration") -> list[str]:
     lines = heading("Quality")
-    away, unit = calibration.distances, clean(calibration.adjustment.network.object_unit)
+    distances, unit = calibration.distances, clean(calibration.adjustment.network.object_unit)
     lines += facts(
         [
             ("Coverage", coverage_in_words(calibration.coverage)),
-            ("Distances", f"{away.min():.4g} to {away.max():.4g} {unit}"),
+            ("Distances", f"{distances.min():.4g} to {distances.max():.4g} {unit}"),
         ]
     )
     lines += ["", "Uncertainty of a projected point (σ, pixels)"]
@@ -121,24 +125,26 @@ def _quality(calibration: "Calibration") -> list[str]:
     lines += ["", *paragraph(mapping_error_in_words(calibration.mapping_error))]
     if calibration.bias is not None:
         lines += paragraph(bias_in_words(calibration.bias))
-    first, *further = cross_validation_in_words(calibration)
-    lines += ["", *paragraph(f"Cross-validation: {first}")]
-    return [*lines, *(line for words in further for line in paragraph(words))]
+    first_sentence, *other_sentences = cross_validation_in_words(calibration)
+    lines += ["", *paragraph(f"Cross-validation: {first_sentence}")]
+    return [*lines, *(line for words in other_sentences for line in paragraph(words))]
 
 
 def mapping_error_in_words(error: "MappingError") -> str:
     """The expected mapping error."""
     percent = lambda share: f"{100 * share:.0f} % of the image"
-    whole = "the whole image" if error.share == 1 else f"the {percent(error.share)} with rays"
+    whole_in_words = (
+        "the whole image" if error.share == 1 else f"the {percent(error.share)} with rays"
+    )
     if error.measured is None:
-        where, stated, more = whole, error, ""
+        where, stated_error, remark = whole_in_words, error, ""
     else:
-        stated = error.measured
-        where = f"the {percent(stated.share)} within the farthest measured point"
-        more = f"; over {whole}, partly extrapolated, {error.rms:.3f} px"
+        stated_error = error.measured
+        where = f"the {percent(stated_error.share)} within the farthest measured point"
+        remark = f"; over {whole_in_words}, partly extrapolated, {error.rms:.3f} px"
     return (
-        f"Expected mapping error over {where}, rotation removed: {stated.rms:.3f} px (RMS), "
-        f"below {stated.quantile():.3f} px with 95 %{more}."
+        f"Expected mapping error over {where}, rotation removed: {stated_error.rms:.3f} px (RMS), "
+        f"below {stated_error.quantile():.3f} px with 95 %{remark}."
     )
 
 
@@ -159,17 +165,17 @@ def map_rows(maps: Sequence["UncertaintyMap"], unit: str) -> list[tuple[str, str
 
 def _held_in(m: "UncertaintyMap", unit: str) -> str:
     if m.frame in ("scene", "rig"):
-        away = f"{m.distance:.3g} {unit}" if m.distance < np.inf else "infinity"
-        return f"the {m.frame}, at {away}"
+        distance = f"{m.distance:.3g} {unit}" if m.distance < np.inf else "infinity"
+        return f"the {m.frame}, at {distance}"
     return {"rotation": "all rays, rotation removed", "camera": "the camera frame"}[m.frame]
 
 
 def _advice(calibration: "Calibration") -> list[str]:
-    found = calibration.advice
+    warnings = calibration.advice
     lines = heading("Advice")
-    if not found:
+    if not warnings:
         return [*lines, "none: directions, distances and coverage are good"]
-    for item in found:
+    for item in warnings:
         lines += paragraph(f"- {item}", hanging=2)
     return lines
 
@@ -188,10 +194,10 @@ def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
     }
     if calibration.converged:
         about |= _quality_dict(calibration)
-    found = {"calibration": about, **result_dict(adjustment, brief)}
-    if "verdict" in found:
-        found["verdict"] = verdict_dict(conclude_calibration(calibration))
-    return found
+    document = {"calibration": about, **result_dict(adjustment, brief)}
+    if "verdict" in document:
+        document["verdict"] = verdict_dict(conclude_calibration(calibration))
+    return document
 
 
 def _boards_dict(board: Board | BoardSet) -> dict:
@@ -251,93 +257,103 @@ def _quality_dict(calibration: "Calibration") -> dict:
     }
 
 
-def choice_text(found: "ModelComparison") -> str:
+def choice_text(comparison: "ModelComparison") -> str:
     """The comparison of models (`model_choice.ModelComparison`)."""
     lines = ["Camera models compared", "=" * 100]
     lines += facts(
         [
             (
                 "Photographs",
-                f"{len(found.views)}, in {found.folds} folds; "
-                f"{len(found.gross)} points that no model explains are left out",
+                f"{len(comparison.views)}, in {comparison.folds} folds; "
+                f"{len(comparison.gross)} points that no model explains are left out",
             ),
         ]
     )
-    lines += ["", *table(MODELS_HEADER, model_rows(found), "lrrrrrrrrr"), ""]
-    lines += paragraph(models_legend(found))
-    lines += [f"not compared: {clean(name)}: {clean(why)}" for name, why in found.failed.items()]
-    return "\n".join(line.rstrip() for line in [*lines, "", *paragraph(found.sentence)])
+    lines += ["", *table(MODELS_HEADER, model_rows(comparison), "lrrrrrrrrr"), ""]
+    lines += paragraph(models_legend(comparison))
+    lines += [
+        f"not compared: {clean(name)}: {clean(why)}" for name, why in comparison.failed.items()
+    ]
+    return "\n".join(line.rstrip() for line in [*lines, "", *paragraph(comparison.sentence)])
 
 
 MODELS_HEADER = ("model", "free", "σ0", "RMS", "left out", "ΔAIC", "ΔBIC", "Δ rms", "largest", "/σ")
 
 
-def model_rows(found: "ModelComparison") -> list[tuple[str, ...]]:
+def model_rows(comparison: "ModelComparison") -> list[tuple[str, ...]]:
     """One row per model (`MODELS_HEADER`)."""
-    low = {name: min(getattr(one, name) for one in found.candidates) for name in ("aic", "bic")}
+    low = {
+        name: min(getattr(candidate, name) for candidate in comparison.candidates)
+        for name in ("aic", "bic")
+    }
     rows = []
-    for one in found.candidates:
-        apart = found.differences.get(one.model)
+    for candidate in comparison.candidates:
+        difference = comparison.differences.get(candidate.model)
         map_of = (
             ("", "", "")
-            if apart is None
-            else (fixed(apart.rms, 3), fixed(apart.largest, 3), fixed(apart.over_sigma, 1))
+            if difference is None
+            else (
+                fixed(difference.rms, 3),
+                fixed(difference.largest, 3),
+                fixed(difference.over_sigma, 1),
+            )
         )
         rows.append(
             (
-                one.model,
-                str(one.free),
-                fixed(one.sigma0, 3),
-                fixed(one.rms, 4),
-                fixed(one.left_out, 4),
-                fixed(one.aic - low["aic"], 1),
-                fixed(one.bic - low["bic"], 1),
+                candidate.model,
+                str(candidate.free),
+                fixed(candidate.sigma0, 3),
+                fixed(candidate.rms, 4),
+                fixed(candidate.left_out, 4),
+                fixed(candidate.aic - low["aic"], 1),
+                fixed(candidate.bic - low["bic"], 1),
                 *map_of,
             )
         )
     return rows
 
 
-def models_legend(found: "ModelComparison") -> str:
+def models_legend(comparison: "ModelComparison") -> str:
     """The columns of `model_rows`."""
     return (
         f"RMS: residuals of all photographs; left out: of those not used for the camera; Δ: images "
-        f"apart from those of {found.best.model}, over the whole image, rotation removed, and RMS "
+        f"apart from those of {comparison.best.model}, over the whole image, rotation removed, "
+        "and RMS "
         "over their σ. Pixels."
     )
 
 
-def choice_dict(found: "ModelComparison") -> dict:
+def choice_dict(comparison: "ModelComparison") -> dict:
     """The comparison of models as a section of JSON."""
     candidates = {}
-    for one in found.candidates:
-        apart = found.differences.get(one.model)
-        candidates[one.model] = {
-            "free": one.free,
-            "unknowns": one.unknowns,
-            "sigma0": one.sigma0,
-            "rms": one.rms,
-            "left_out": one.left_out,
-            "aic": one.aic,
-            "bic": one.bic,
-            "parameters": one.calibration.parameters,
-            "sigma": one.calibration.sigma,
+    for candidate in comparison.candidates:
+        difference = comparison.differences.get(candidate.model)
+        candidates[candidate.model] = {
+            "free": candidate.free,
+            "unknowns": candidate.unknowns,
+            "sigma0": candidate.sigma0,
+            "rms": candidate.rms,
+            "left_out": candidate.left_out,
+            "aic": candidate.aic,
+            "bic": candidate.bic,
+            "parameters": candidate.calibration.parameters,
+            "sigma": candidate.calibration.sigma,
             "difference": None
-            if apart is None
+            if difference is None
             else {
-                "rms": apart.rms,
-                "largest": apart.largest,
-                "over_sigma": apart.over_sigma,
+                "rms": difference.rms,
+                "largest": difference.largest,
+                "over_sigma": difference.over_sigma,
             },
         }
     return {
-        "suffices": found.suffices.model,
-        "best": found.best.model,
-        "sentence": found.sentence,
-        "folds": found.folds,
-        "photographs": list(found.views),
-        "gross": [list(pair) for pair in found.gross],
-        "failed": found.failed,
+        "suffices": comparison.suffices.model,
+        "best": comparison.best.model,
+        "sentence": comparison.sentence,
+        "folds": comparison.folds,
+        "photographs": list(comparison.views),
+        "gross": [list(pair) for pair in comparison.gross],
+        "failed": comparison.failed,
         "models": candidates,
     }
 

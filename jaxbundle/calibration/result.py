@@ -79,15 +79,15 @@ class Calibration(TableMethods):
     def stated_sigma(self) -> dict[str, float]:
         """σ of the free parameters by name, under errors that image points share where these are
         known and their σ are larger."""
-        found = self.adjustment.cameras[self.name]["parameters"]
-        return {name: not_none(stated_sigma_of(found[name])) for name in self.sigma}
+        parameters = self.adjustment.cameras[self.name]["parameters"]
+        return {name: not_none(stated_sigma_of(parameters[name])) for name in self.sigma}
 
     @property
     def camera(self) -> Camera:
         """The calibrated camera with no free parameters."""
-        given = self.adjustment.network.cameras[0]
+        adjusted_camera = self.adjustment.network.cameras[0]
         return dataclasses.replace(
-            given, parameters=self.parameters, free=(), sigma={}, observed={}
+            adjusted_camera, parameters=self.parameters, free=(), sigma={}, observed={}
         )
 
     @functools.cached_property
@@ -158,8 +158,10 @@ class Calibration(TableMethods):
     @property
     def _contradictions(self) -> list[str]:
         """Halves of the photographs that contradict each other, in words."""
-        found = judge_replication(self.adjustment)
-        return [f"{found.brief}: {found.words}"] if found is not None and found.lowers else []
+        finding = judge_replication(self.adjustment)
+        return (
+            [f"{finding.brief}: {finding.words}"] if finding is not None and finding.lowers else []
+        )
 
     @property
     def suggestions(self) -> list[str]:
@@ -190,7 +192,7 @@ class Calibration(TableMethods):
     @functools.cached_property
     def shortcomings(self) -> list[str]:
         """Warnings in words."""
-        found = advice(
+        warnings = advice(
             self.position,
             self.rotation,
             self.views.centres,
@@ -204,17 +206,20 @@ class Calibration(TableMethods):
         )
         missed = self._missing_affinity
         if missed is not None and missed.missed:
-            found = [*found, str(missed)]
+            warnings = [*warnings, str(missed)]
         # Image points are removed one by one: only counted by corner do they show a bad print.
         problem = self.adjustment.problem
-        removed = [
-            row for one in self.adjustment.removed if one.kind == "image" for row in one.rows
+        removed_rows = [
+            row
+            for removal in self.adjustment.removed
+            if removal.kind == "image"
+            for row in removal.rows
         ]
-        points = [problem.network.points.id[problem.point[row]] for row in removed]
-        found += often_removed(points, len(problem.network.images))
+        points = [problem.network.points.id[problem.point[row]] for row in removed_rows]
+        warnings += often_removed(points, len(problem.network.images))
         if self.bias is not None and self.bias.found:
-            found = [*found, self.bias.sentence]
-        return found
+            warnings = [*warnings, self.bias.sentence]
+        return warnings
 
     def uncertainty(
         self, distance: float = np.inf, frame: str = "scene", grid: tuple[int, int] = quality.GRID
@@ -234,15 +239,15 @@ class Calibration(TableMethods):
         scene."""
         # Near the board the poses dominate, at infinity the camera; three distances also determine
         # the whole curve (`quality.over_distance`).
-        near = float(np.median(self.distances))
-        chosen = (
-            ("scene", near),
-            ("scene", 10 * near),
+        median_distance = float(np.median(self.distances))
+        frames_and_distances = (
+            ("scene", median_distance),
+            ("scene", 10 * median_distance),
             ("scene", np.inf),
             ("rotation", np.inf),
             ("camera", np.inf),
         )
-        return [self.uncertainty(distance, frame) for frame, distance in chosen]
+        return [self.uncertainty(distance, frame) for frame, distance in frames_and_distances]
 
     def uncertainty_over_distance(
         self, distances: Float[np.ndarray, " n"]
@@ -255,10 +260,10 @@ class Calibration(TableMethods):
         of a projected point at them in the middle and in the corners (pixels); and these three of
         the maps of the report, as rows."""
         reported = np.array([(m.distance, m.middle, m.corners) for m in self._scene_maps]).T
-        near = reported[0, np.isfinite(reported[0])]
+        reported_distances = reported[0, np.isfinite(reported[0])]
         # 400 of them, dense enough to show every dip
         ends = self.distances.min() / 4, 100 * self.distances.max()
-        distances = np.union1d(np.geomspace(*ends, 400), near)
+        distances = np.union1d(np.geomspace(*ends, 400), reported_distances)
         return distances, *self.uncertainty_over_distance(distances), reported
 
     @property
@@ -279,8 +284,10 @@ class Calibration(TableMethods):
         self, distance: float = np.inf, frame: str = "scene", ax: "Axes | None" = None
     ) -> "Axes":
         """σ of a projected point over the image; matplotlib axes."""
-        found = self.uncertainty(distance, frame, quality.DRAWN)
-        return plotting.uncertainty_image(found, self.views.image_size, self._unit, self.name, ax)
+        uncertainty = self.uncertainty(distance, frame, quality.DRAWN)
+        return plotting.uncertainty_image(
+            uncertainty, self.views.image_size, self._unit, self.name, ax
+        )
 
     def plot_uncertainty_over_distance(self, ax: "Axes | None" = None) -> "Axes":
         """The curves of `uncertainty_curves`, with the values of the report marked; matplotlib
@@ -316,7 +323,9 @@ class Calibration(TableMethods):
         """One row a parameter: columns parameter, value, sigma (NaN: not estimated), under
         correlated errors, where these are known, sigma_correlated."""
         names = list(self.parameters)
-        column = lambda found: np.array([found.get(name, np.nan) for name in names], dtype=float)
+        column = lambda by_name: np.array(
+            [by_name.get(name, np.nan) for name in names], dtype=float
+        )
         table = {
             "parameter": np.array(names, dtype=object),
             "value": column(self.parameters),
@@ -330,13 +339,13 @@ class Calibration(TableMethods):
     def __str__(self) -> str:
         if not self.converged:
             return f"Calibration of {self.name}: not solved ({self.adjustment.termination})"
-        shown = ", ".join(
+        values_in_words = ", ".join(
             f"{n} {self.parameters[n]:.6g} ± {s:.2g}" for n, s in self.stated_sigma.items()
         )
         halves = self.adjustment.replication
         return (
             f"Calibration of {self.name}: {len(self.views)} photographs, "
-            f"{len(self.views.failed)} failed, RMS {self.rms:.3f} px\n{shown}"
+            f"{len(self.views.failed)} failed, RMS {self.rms:.3f} px\n{values_in_words}"
             + ("" if halves is None else f"\n{halves.sentence}")
         )
 

@@ -28,7 +28,7 @@ class Calibrations(TableMethods):
 
     @property
     def converged(self) -> bool:
-        return all(one.converged for one in self.cameras.values())
+        return all(calibration.converged for calibration in self.cameras.values())
 
     def to_dict(self, brief: bool = False) -> dict[str, Any]:
         """The result as plain dicts and numbers, as in JSON: of one camera, or of several by name,
@@ -39,13 +39,13 @@ class Calibrations(TableMethods):
 
     def table(self) -> dict[str, np.ndarray]:
         """One row a parameter of a camera: columns camera, parameter, value, sigma."""
-        tables = {name: one.table() for name, one in self.cameras.items()}
+        tables = {name: calibration.table() for name, calibration in self.cameras.items()}
         rows = [len(columns["value"]) for columns in tables.values()]
-        joined = {
+        parameter_columns = {
             column: np.concatenate([columns[column] for columns in tables.values()])
             for column in ("parameter", "value", "sigma")
         }
-        return {"camera": np.repeat(np.array([*tables], dtype=object), rows), **joined}
+        return {"camera": np.repeat(np.array([*tables], dtype=object), rows), **parameter_columns}
 
     def __str__(self) -> str:
         parts = [] if self.rig is None else [str(self.rig)]
@@ -53,13 +53,13 @@ class Calibrations(TableMethods):
 
     def report(self) -> str:
         """The verdict on several cameras, the report of their rig, and those of all cameras."""
-        return self._in_words([one.report() for one in self.cameras.values()])
+        return self._in_words([calibration.report() for calibration in self.cameras.values()])
 
     def summary(self) -> str:
         """The same without the reports of the adjustments: a page or two a camera."""
         from jaxbundle.calibration.report import summary
 
-        return self._in_words([summary(one) for one in self.cameras.values()])
+        return self._in_words([summary(calibration) for calibration in self.cameras.values()])
 
     def _in_words(self, of_cameras: Sequence[str]) -> str:
         from jaxbundle.calibration.rig.report import rig_text
@@ -91,12 +91,14 @@ def calibrate_cameras(
     """
     if isinstance(photographs, Mapping) and rig and len(photographs) < 2:
         raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
-    calibrate_one = lambda name, given, tell: calibrate(
-        given, board, camera=name, progress=tell, **options
+    calibrate_one = lambda name, photographs_of_camera, tell: calibrate(
+        photographs_of_camera, board, camera=name, progress=tell, **options
     )
-    found = calibrate_each(photographs, calibrate_one, progress)
-    together = None
-    if rig and all(one.converged for one in found.values()):
-        given = {name: options[name] for name in (*SHARED, "robust") if name in options}
-        together = calibrate_rig(found, **given)
-    return Calibrations(found, together)
+    calibrations = calibrate_each(photographs, calibrate_one, progress)
+    rig_calibration = None
+    if rig and all(calibration.converged for calibration in calibrations.values()):
+        photographs_of_camera = {
+            name: options[name] for name in (*SHARED, "robust") if name in options
+        }
+        rig_calibration = calibrate_rig(calibrations, **photographs_of_camera)
+    return Calibrations(calibrations, rig_calibration)

@@ -11,21 +11,21 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.several import Calibrations
 
 
-def several_text(found: "Calibrations") -> str:
+def several_text(calibrations: "Calibrations") -> str:
     """The verdict on several cameras, and what it follows from."""
-    _, words, findings = conclude_calibrations(found)
-    rows = [("Verdict", words), *((clean(one.about), one.words) for one in findings)]
-    lines = [f"Calibration of {len(found.cameras)} cameras", "=" * 100, *facts(rows)]
+    _, words, findings = conclude_calibrations(calibrations)
+    rows = [("Verdict", words), *((clean(finding.about), finding.words) for finding in findings)]
+    lines = [f"Calibration of {len(calibrations.cameras)} cameras", "=" * 100, *facts(rows)]
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
-def calibrations_dict(found: "Calibrations", brief: bool = False) -> dict:
+def calibrations_dict(calibrations: "Calibrations", brief: bool = False) -> dict:
     """The JSON of one calibration, or of several under their names, with the rig."""
-    if len(found.cameras) == 1 and found.rig is None:
-        return next(iter(found.cameras.values())).to_dict(brief)
-    parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
-    verdict = verdict_dict(conclude_calibrations(found))
-    document = {"converged": found.converged, "verdict": verdict, "calibrations": parts}
-    if found.rig is not None:
-        document["rig"] = rig_dict(found.rig, brief)
+    if len(calibrations.cameras) == 1 and calibrations.rig is None:
+        return next(iter(calibrations.cameras.values())).to_dict(brief)
+    parts = {name: calibration.to_dict(brief) for name, calibration in calibrations.cameras.items()}
+    verdict = verdict_dict(conclude_calibrations(calibrations))
+    document = {"converged": calibrations.converged, "verdict": verdict, "calibrations": parts}
+    if calibrations.rig is not None:
+        document["rig"] = rig_dict(calibrations.rig, brief)
     return document

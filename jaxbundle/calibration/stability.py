@@ -104,8 +104,8 @@ class Stability(TableMethods):
             "probability_slope": self.slope_probability,
             "about_slope": self.about_slope,
         }
-        known = {name: column for name, column in columns.items() if column is not None}
-        return {"parameter": np.array(self.names, dtype=object), **known}
+        known_columns = {name: column for name, column in columns.items() if column is not None}
+        return {"parameter": np.array(self.names, dtype=object), **known_columns}
 
     def __str__(self) -> str:
         """Parameters and tests in lines."""
@@ -134,10 +134,10 @@ class Stability(TableMethods):
 
     def to_dict(self) -> dict:
         """The result as plain dicts and numbers, as in JSON."""
-        test = lambda one: {
-            "chi2": one.chi2,
-            "degrees": one.degrees,
-            "probability": one.probability,
+        test = lambda chi2_test: {
+            "chi2": chi2_test.chi2,
+            "degrees": chi2_test.degrees,
+            "probability": chi2_test.probability,
         }
         rows = {}
         for k, name in enumerate(self.names):
@@ -191,21 +191,21 @@ def stability(
     mean, mean_sigma, tau, probability = np.array(columns).T
     model = get_model(cameras[0].model)
     # The derivatives of the image at the mean camera.
-    every, changes = _changes_of_tied(cameras[0], names)
-    whole = {
+    all_names, changes = _changes_of_tied(cameras[0], names)
+    mean_of = {
         **default_parameters(model),
         **cameras[0].parameters,
-        **dict(zip(every, changes @ mean)),
+        **dict(zip(all_names, changes @ mean)),
     }
-    given = np.array([whole[name] for name in model.parameters])
+    mean_parameters = np.array([mean_of[name] for name in model.parameters])
     G, H = (
-        changes.T @ mapping_form(cameras[0], given, every, frame=f) @ changes
+        changes.T @ mapping_form(cameras[0], mean_parameters, all_names, frame=f) @ changes
         for f in ("camera", "rotation")
     )
     # Images by H, without rotation: what matters to a user who orients each photograph anew.
     F = _without_rotation(G, H, sigma.mean(0))
     d = p - p.mean(0)
-    found = float(np.einsum("nk,kl,nl->", d, H, d)) / (len(p) - 1)
+    mean_square = float(np.einsum("nk,kl,nl->", d, H, d)) / (len(p) - 1)
     expected = float(np.einsum("kl,nlk->", H, C)) / len(p)
     x, trend = None, (None,) * 4
     if at is not None:
@@ -222,9 +222,9 @@ def stability(
         probability,
         _homogeneity(p, C),
         _homogeneity(p @ F.T, F @ C @ F.T),
-        np.sqrt(found),
+        np.sqrt(mean_square),
         np.sqrt(expected),
-        float(np.sqrt(max(found - expected, 0.0))),
+        float(np.sqrt(max(mean_square - expected, 0.0))),
         x,
         *trend,
     )
@@ -243,18 +243,19 @@ def _check(
             f"stability: {len(at)} numbers for {len(calibrations)} calibrations; expected one for "
             "each, and three different ones at least"
         )
-    first, (free, _) = calibrations[0]
-    names = _first_of_tied(first, free)
-    if first.image_size is None:
-        raise InputError(f"camera {first.id!r}: its image_size in pixels is needed")
-    every, _ = _changes_of_tied(first, names)
+    first_camera, (free, _) = calibrations[0]
+    names = _first_of_tied(first_camera, free)
+    if first_camera.image_size is None:
+        raise InputError(f"camera {first_camera.id!r}: its image_size in pixels is needed")
+    changing, _ = _changes_of_tied(first_camera, names)
     for number, (camera, (free, _)) in enumerate(calibrations, 1):
-        held = {n: v for n, v in camera.parameters.items() if n not in every}
-        same = {n: v for n, v in first.parameters.items() if n not in every}
-        if (camera.model, camera.image_size) != (first.model, first.image_size):
+        held_values = {n: v for n, v in camera.parameters.items() if n not in changing}
+        held_of_first = {n: v for n, v in first_camera.parameters.items() if n not in changing}
+        if (camera.model, camera.image_size) != (first_camera.model, first_camera.image_size):
             raise InputError(f"calibration {number} is of another camera model or image size")
         if {*_first_of_tied(camera, free)} != {*names} or any(
-            held.get(n, 0.0) != same.get(n, 0.0) for n in held | same
+            held_values.get(n, 0.0) != held_of_first.get(n, 0.0)
+            for n in held_values | held_of_first
         ):
             raise InputError(f"calibration {number} has other free parameters, or held values")
     return names
@@ -263,8 +264,8 @@ def _check(
 def _first_of_tied(camera: Camera, names: Sequence[str]) -> tuple[str, ...]:
     """Free parameters, of equal ones (`Camera.tie`) the first: they are one unknown, and their
     covariance is singular."""
-    others = {name for group in camera.tie for name in [n for n in group if n in names][1:]}
-    return tuple(name for name in names if name not in others)
+    equal_names = {name for group in camera.tie for name in [n for n in group if n in names][1:]}
+    return tuple(name for name in names if name not in equal_names)
 
 
 def _changes_of_tied(
@@ -273,8 +274,8 @@ def _changes_of_tied(
     """All parameters that change with those of `names`, themselves and equal ones, and by how
     much."""
     equal = {name: next((g for g in camera.tie if name in g), (name,)) for name in names}
-    every = tuple(dict.fromkeys(other for group in equal.values() for other in group))
-    return every, np.array([[float(n in equal[name]) for name in names] for n in every])
+    all_names = tuple(dict.fromkeys(equal_name for group in equal.values() for equal_name in group))
+    return all_names, np.array([[float(n in equal[name]) for name in names] for n in all_names])
 
 
 def _homogeneity(
@@ -298,8 +299,8 @@ def _without_rotation(
     # changes of parameters cancel in the image: these are dropped. 1e-12, since G holds squares:
     # they move the image by less than 1e-6 of what the others do.
     size, U = np.linalg.eigh(G * unit)
-    seen = size > 1e-12 * size[-1]
-    root = U[:, seen] / np.sqrt(size[seen])
+    is_determined = size > 1e-12 * size[-1]
+    root = U[:, is_determined] / np.sqrt(size[is_determined])
     mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
     # μ below a tenth: nearly a rotation, as a shift of the principal point is. Larger: real changes
     # are left out too; smaller: changes count that the next orientation absorbs
@@ -320,8 +321,8 @@ def _line_of(
     def fit(variance: float) -> tuple[float, float, float]:
         w = 1 / (sigma**2 + variance)
         Q = np.linalg.inv(A.T @ (w[:, None] * A))
-        found = Q @ A.T @ (w * p)
-        return found[-1], np.sqrt(Q[-1, -1]), float(w @ (p - A @ found) ** 2)
+        coefficients = Q @ A.T @ (w * p)
+        return coefficients[-1], np.sqrt(Q[-1, -1]), float(w @ (p - A @ coefficients) ** 2)
 
     # τ² is 0 if the epochs scatter no more than their σ; it is below n times their variance, where
     # χ² ≤ (n − 1)/n is already less than any number of degrees of freedom

@@ -62,9 +62,9 @@ def start_values(
                 "several, 8 or more, from different directions"
             )
         solved = _solve(views, model, free)
-        used = solved.views
-        if not used.all():
-            views = views.take(used, "its points are too few or lie on a line")
+        is_used = solved.views
+        if not is_used.all():
+            views = views.take(is_used, "its points are too few or lie on a line")
             continue
         # Seen from behind in some views only: their numbering is wrong. In all views: the
         # photographs may be mirrored, which is said but changes no residual.
@@ -90,12 +90,12 @@ def start_values(
 
 
 def _solve(views: BoardViews, model: CameraModel, free: Sequence[str]) -> FirstCamera:
-    (found,) = first_cameras(
+    (first_camera,) = first_cameras(
         views.board.points, views.xy[None], views.image_size, model, free, threads=1
     )
-    if found.solved:
-        return found
-    why = found.remark if found.status == WEAK else found.status
+    if first_camera.solved:
+        return first_camera
+    why = first_camera.remark if first_camera.status == WEAK else first_camera.status
     raise NotSolvedError(
         f"not solved: {len(views)} photographs of the board do not determine the camera "
         f"({why}); take it from different directions, tilted by 20° to 45°, some with "

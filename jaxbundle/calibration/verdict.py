@@ -32,11 +32,13 @@ def conclude_calibration(calibration: "Calibration") -> Verdict:
     )
 
 
-def conclude_calibrations(found: "Calibrations") -> Verdict:
+def conclude_calibrations(calibrations: "Calibrations") -> Verdict:
     """The verdict on several cameras (`Calibrations`): a finding for each, and for their rig."""
-    findings = [_judge_camera(name, one) for name, one in found.cameras.items()]
-    if found.rig is not None:
-        findings.append(_judge_rig(found.rig))
+    findings = [
+        _judge_camera(name, calibration) for name, calibration in calibrations.cameras.items()
+    ]
+    if calibrations.rig is not None:
+        findings.append(_judge_rig(calibrations.rig))
     return Verdict(*in_words(findings, 0), tuple(findings))
 
 
@@ -64,17 +66,19 @@ def find(calibration: "Calibration") -> list[Finding]:
     covered, checked = calibration.coverage, calibration.cross_validation
     good = covered.part >= ADVICE.min_part and covered.reach >= ADVICE.min_reach
     words = coverage_in_words(covered)
-    found = [Finding("Coverage", GOOD if good else DOUBTFUL, words, words)]
+    findings = [Finding("Coverage", GOOD if good else DOUBTFUL, words, words)]
     if checked is not None:
         state = DOUBTFUL if checked.test > ADVICE.max_test else GOOD
         words = " ".join(cross_validation_in_words(calibration))
-        found.append(Finding("Cross-validation", state, words, "halves that contradict each other"))
+        findings.append(
+            Finding("Cross-validation", state, words, "halves that contradict each other")
+        )
     if (bias := calibration.bias) is not None:
         # Half of the variance: as large as all errors of measurement together.
         state = GOOD if not bias.found else DOUBTFUL if bias.ratio > 0.5 else NOTED
         brief = f"{100 * bias.ratio:.0f} % of the residual variance are a bias"
-        found.append(Finding("Bias", state, bias.sentence, brief))
-    return found
+        findings.append(Finding("Bias", state, bias.sentence, brief))
+    return findings
 
 
 def coverage_in_words(covered: "Coverage") -> str:

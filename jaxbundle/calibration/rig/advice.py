@@ -17,19 +17,25 @@ def undetermined_mountings(rig: "RigCalibration") -> dict[str, tuple[float, np.n
     """Cameras whose position has a σ beyond the distance of the boards, which is no knowledge of
     it: by name the σ and its direction."""
     weak = {name: mounting.weakest for name, mounting in rig.mountings.items()}
-    return {name: found for name, found in weak.items() if found[0] > rig.distance}
+    return {
+        name: sigma_and_direction
+        for name, sigma_and_direction in weak.items()
+        if sigma_and_direction[0] > rig.distance
+    }
 
 
 def shared_epochs(rig: "RigCalibration") -> Float[np.ndarray, "cameras cameras"]:
     """Number of epochs at which two cameras see the same board; of one, those with any."""
-    given, used = rig.rig, rig.used
-    board = given.board_of_points[given.point[used]]
-    views = np.unique(np.stack([given.camera[used], given.epoch[used], board]), axis=1)
-    number, rows = len(given.cameras), len(given.epochs)
-    seen = np.zeros((number, rows * len(given.boards)), bool)
-    seen[views[0], views[1] * len(given.boards) + views[2]] = True
-    both = seen[:, None] & seen[None]
-    return both.reshape(number, number, rows, -1).any(3).sum(2)
+    declared_rig, is_used = rig.rig, rig.used
+    board = declared_rig.board_of_points[declared_rig.point[is_used]]
+    views = np.unique(
+        np.stack([declared_rig.camera[is_used], declared_rig.epoch[is_used], board]), axis=1
+    )
+    number, rows = len(declared_rig.cameras), len(declared_rig.epochs)
+    is_seen = np.zeros((number, rows * len(declared_rig.boards)), bool)
+    is_seen[views[0], views[1] * len(declared_rig.boards) + views[2]] = True
+    seen_by_both = is_seen[:, None] & is_seen[None]
+    return seen_by_both.reshape(number, number, rows, -1).any(3).sum(2)
 
 
 def advise_rig(rig: "RigCalibration") -> list[str]:
@@ -43,9 +49,10 @@ def advise_rig(rig: "RigCalibration") -> list[str]:
 
 
 def _advise_undetermined(rig: "RigCalibration") -> Iterator[str]:
-    for name, (sigma, along) in undetermined_mountings(rig).items():
+    for name, (sigma, direction) in undetermined_mountings(rig).items():
         yield (
-            f"the position of {name!r} is not determined along {_direction(along)}: σ {sigma:.3g} "
+            f"the position of {name!r} is not determined along {_direction(direction)}: σ "
+            f"{sigma:.3g} "
             f"{rig.object_unit} is beyond the distance of the boards; {_remedy(rig, name)}"
         )
 
@@ -55,11 +62,12 @@ def _advise_overlaps(rig: "RigCalibration") -> Iterator[str]:
     shared = shared_epochs(rig).astype(int)
     np.fill_diagonal(shared, 0)
     for k, name in enumerate(rig.names):
-        most = int(shared[k].max())
-        if 0 < most < ADVICE.min_views:
-            other = rig.names[int(shared[k].argmax())]
+        largest_number = int(shared[k].max())
+        if 0 < largest_number < ADVICE.min_views:
+            partner = rig.names[int(shared[k].argmax())]
             yield (
-                f"camera {name!r} sees a board together with {other!r} at {count(most, 'epoch')}, "
+                f"camera {name!r} sees a board together with {partner!r} at "
+                f"{count(largest_number, 'epoch')}, "
                 f"with others at no more: photograph a board with both at the same time, at "
                 f"{ADVICE.min_views} epochs or more"
             )
@@ -76,10 +84,10 @@ def _advise_boards(rig: "RigCalibration") -> Iterator[str]:
 def _advise_weakest(rig: "RigCalibration") -> str:
     """The photograph that the weakest mounting needs."""
     name, mounting = max(rig.mountings.items(), key=lambda item: item[1].weakest[0])
-    sigma, along = mounting.weakest
+    sigma, direction = mounting.weakest
     weakest = (
         f"next: the position of {name!r} is the weakest, σ {sigma:.2g} {rig.object_unit} along "
-        f"{_direction(along)}: "
+        f"{_direction(direction)}: "
     )
     view = rig.next_view(name)
     if view is None or view.after >= view.before:
@@ -103,15 +111,15 @@ def _remedy(rig: "RigCalibration", name: str) -> str:
         )
     shared = shared_epochs(rig).astype(float)
     np.fill_diagonal(shared, -1)
-    other = rig.names[int(shared[rig.names.index(name)].argmax())]
+    partner = rig.names[int(shared[rig.names.index(name)].argmax())]
     return (
-        f"photograph a board with {name!r} and {other!r} at the same time, near, tilted, and at "
+        f"photograph a board with {name!r} and {partner!r} at the same time, near, tilted, and at "
         "the edges of both images"
     )
 
 
-def _direction(along: Float[np.ndarray, "3"]) -> str:
+def _direction(direction: Float[np.ndarray, "3"]) -> str:
     # The sign of an axis is arbitrary: its largest part is positive.
-    along = along * np.sign(along[np.abs(along).argmax()])
+    direction = direction * np.sign(direction[np.abs(direction).argmax()])
     # No negative zeros.
-    return f"({', '.join(f'{x + 0.0:.2f}' for x in along.round(2))})"
+    return f"({', '.join(f'{x + 0.0:.2f}' for x in direction.round(2))})"

@@ -110,7 +110,7 @@ def calibrate_rig(  # noqa: PLR0913 - what a rig may be given by
     check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
     wanded = [] if wand is None else [name for name in wand.markers if name not in photographs]
     _check(photographs, wanded)
-    known = known_mountings(mountings, bases, [*photographs, *wanded])
+    known_of_mountings = known_mountings(mountings, bases, [*photographs, *wanded])
     unknowns = _unknowns_of_clocks(synchronize, times, bool(options.get("board_free")))
     if bodies is not None:
         bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
@@ -121,25 +121,25 @@ def calibrate_rig(  # noqa: PLR0913 - what a rig may be given by
     if wand is not None and (unknowns or options.get("board_free")):
         raise InputError("wand: expected cameras that are synchronised, and boards that are known")
     calibrations = _calibrate_cameras(views, options, progress)
-    given = {name: options[name] for name in SHARED if name in options}
-    if options.get("robust") and not given.get("snooping"):
+    shared_options = {name: options[name] for name in SHARED if name in options}
+    if options.get("robust") and not shared_options.get("snooping"):
         # Points downweighted in a camera have full weight in the rig.
-        given["snooping"] = "pope"
+        shared_options["snooping"] = "pope"
     bodies = declared if bodies is None else bodies
     if unknowns:
         seconds = times_of_photographs(calibrations, times)
         rig, connections = start_unsynchronized(
-            calibrations, bodies, fixed, known, seconds, unknowns
+            calibrations, bodies, fixed, known_of_mountings, seconds, unknowns
         )
     else:
         body = None
         if wand is not None:
             unit = next(iter(calibrations.values())).adjustment.network.object_unit
             body = start_wand(wand, calibrations, unit, progress)
-        rig, connections = start_rig(calibrations, bodies, fixed, known, wand=body)
+        rig, connections = start_rig(calibrations, bodies, fixed, known_of_mountings, wand=body)
         if body is not None:
             rig = add_wand(rig, body, connections, calibrations)
-    return _adjust_together(calibrations, rig, connections, **given)
+    return _adjust_together(calibrations, rig, connections, **shared_options)
 
 
 def _unknowns_of_clocks(
@@ -154,20 +154,20 @@ def _unknowns_of_clocks(
             f"synchronize: got {show(synchronize)}; expected unknowns of the clocks, of "
             f"{', '.join(CLOCK_PARAMETERS)}"
         )
-    found = tuple(word.strip() for word in words if word.strip())
-    for word in found:
+    unknowns = tuple(word.strip() for word in words if word.strip())
+    for word in unknowns:
         one_of("synchronize", word, CLOCK_PARAMETERS)
-    if found and times is None:
+    if unknowns and times is None:
         raise InputError(f"synchronize: the times of the photographs are missing (times); {HOW}")
-    if times is not None and not found:
+    if times is not None and not unknowns:
         raise InputError("times: are for cameras that are not synchronised; give synchronize, too")
-    if found and board_free:
+    if unknowns and board_free:
         # A similarity of the points has no action on control poses (`declare.FLOATING`).
         raise InputError(
             "board_free: points of a board are not free where cameras are not synchronised; "
             "expected board_sigma, or known points"
         )
-    return found
+    return unknowns
 
 
 def _calibrate_cameras(
@@ -176,7 +176,7 @@ def _calibrate_cameras(
     progress: Progress | None,
 ) -> dict[str, Calibration]:
     """The calibration of every camera by itself."""
-    if all(isinstance(one, Calibration) for one in views.values()):
+    if all(isinstance(calibration, Calibration) for calibration in views.values()):
         unused = {*options} - {*SHARED, "robust"}
         if unused:
             raise InputError(
@@ -184,17 +184,19 @@ def _calibrate_cameras(
                 "are calibrated already; omit it"
             )
 
-    def calibrate_one(name: str, given: Any, tell: Progress | None) -> Calibration:
-        if isinstance(given, Calibration):
-            return given
-        return calibrate(given, camera=name, progress=tell, **options)
+    def calibrate_one(
+        name: str, photographs_or_calibration: Any, tell: Progress | None
+    ) -> Calibration:
+        if isinstance(photographs_or_calibration, Calibration):
+            return photographs_or_calibration
+        return calibrate(photographs_or_calibration, camera=name, progress=tell, **options)
 
-    found = calibrate_each(views, calibrate_one, progress)
-    for name, one in found.items():
-        if not one.converged:
-            why = one.adjustment.termination
+    calibrations = calibrate_each(views, calibrate_one, progress)
+    for name, calibration in calibrations.items():
+        if not calibration.converged:
+            why = calibration.adjustment.termination
             raise NotSolvedError(f"not solved: camera {name} alone: {why}")
-    return found
+    return calibrations
 
 
 def _adjust_together(
@@ -216,47 +218,51 @@ def _adjust_together(
         )
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
     size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in rig.cameras])
-    left_out, held = [], {}
+    left_out, held_unknowns = [], {}
     if rig.trajectory is None:
-        found = adjust_rig(rig, max_iterations)
+        result = adjust_rig(rig, max_iterations)
     else:
-        rig, found, held = adjust_unsynchronized(rig, max_iterations)
+        rig, result, held_unknowns = adjust_unsynchronized(rig, max_iterations)
         left_out = without_run(rig)
-    require_solved(found, connections.ties)
+    require_solved(result, connections.ties)
     # Each time from the start values: a wrong epoch may have led the adjustment far away.
-    while (bad := _contradictions(rig, found, size)) and snooping:
+    while (bad := _contradictions(rig, result, size)) and snooping:
         why = (
             "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
             if rig.trajectory is None
             else "does not fit the motion and the mounting (RMS {:.1f} px): is its time right?"
         )
         left_out += [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
-        found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
+        result = require_solved(
+            leave_out(rig, result, np.isin(rig.epoch, list(bad)), max_iterations)
+        )
     if snooping:
-        found = snoop_rig(found, snooping, significance, max_iterations)
+        result = snoop_rig(result, snooping, significance, max_iterations)
     why = "kept, but does not fit the mounting (RMS {:.1f} px)"
     tolerated = [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
-    return RigCalibration(dict(calibrations), rig, found, left_out, tolerated, connections, held)
+    return RigCalibration(
+        dict(calibrations), rig, result, left_out, tolerated, connections, held_unknowns
+    )
 
 
-def _check(photographs: Any, others: Sequence[str]) -> None:
-    """Refuse photographs of one camera without `others`."""
+def _check(photographs: Any, other_cameras: Sequence[str]) -> None:
+    """Refuse photographs of one camera without `other_cameras`."""
     if not isinstance(photographs, Mapping):
         raise InputError(
             "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
             f"is {show(photographs)}"
         )
-    if len(photographs) < (1 if others else 2):
+    if len(photographs) < (1 if other_cameras else 2):
         raise InputError("a rig has at least two cameras: give the photographs of each")
 
 
-def require_solved(found: Result, ties: Sequence[MotionTie] = ()) -> Result:
+def require_solved(result: Result, ties: Sequence[MotionTie] = ()) -> Result:
     """The result of an adjustment that converged; `ties`: by motion, for the message.
 
     **Raises:** `NotSolvedError` for another one."""
-    if not found.converged:
-        names = found.undetermined
-        what = f"; not determined: {list_some(names, 8, str)}" if names else ""
+    if not result.converged:
+        names = result.undetermined
+        details = f"; not determined: {list_some(names, 8, str)}" if names else ""
         advice = (
             "what is given of the mountings hardly determines what the motion of the rig leaves "
             "open: give it with a smaller σ, or rotate the rig about a second axis"
@@ -265,22 +271,22 @@ def require_solved(found: Result, ties: Sequence[MotionTie] = ()) -> Result:
             "simultaneous"
         )
         raise NotSolvedError(
-            f"not solved: the rig did not converge ({found.termination}){what}; {advice}",
+            f"not solved: the rig did not converge ({result.termination}){details}; {advice}",
             list(names),
         )
-    return found
+    return result
 
 
 def _contradictions(
-    rig: Rig, found: Result, size: Float[np.ndarray, "cameras 2"]
+    rig: Rig, result: Result, size: Float[np.ndarray, "cameras 2"]
 ) -> dict[int, float]:
     """Epochs of several views that do not fit, with their RMS in pixels; `size` of a pixel,
     [cameras, 2]."""
-    v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
+    v = rig.in_order(result.solution.residuals) * rig.sigma / size[rig.camera]
     # Views of each pose: a board by a camera.
     number = np.zeros((len(rig.epochs), len(size), len(rig.boards)))
     board = rig.board_of_points[rig.point]
-    np.add.at(number, (rig.epoch, rig.camera, board), used_rays(rig, found.problem))
+    np.add.at(number, (rig.epoch, rig.camera, board), used_rays(rig, result.problem))
     number = number.reshape(len(number), -1)
     rays = number.sum(1)
     rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))

@@ -40,12 +40,12 @@ class Clock:
     def in_words(self) -> list[str]:
         """Every unknown with its σ; of one that is not determined, why."""
         scale = {OFFSET: (1e3, "ms"), RATE: (1e6, "ppm"), READ_OUT: (1e3, "ms")}
-        found = []
+        sentences = []
         for name in self.estimated:
             factor, unit = scale[name]
             value, sigma = self.values[name]
-            found.append(f"{name} {factor * value:.4f} ± {factor * sigma:.2g} {unit}")
-        return [*found, *(f"{name} {why}" for name, why in self.held.items())]
+            sentences.append(f"{name} {factor * value:.4f} ± {factor * sigma:.2g} {unit}")
+        return [*sentences, *(f"{name} {why}" for name, why in self.held.items())]
 
     def to_dict(self) -> dict:
         """Values, σ and what is not determined as plain dicts and numbers."""

@@ -110,13 +110,13 @@ def connect(
     boards: Sequence[str],
     bodies: Sequence[int],
     views: Iterable[BoardView],
-    given: Mapping[int, Float[np.ndarray, "3"]] | None = None,
+    given_positions: Mapping[int, Float[np.ndarray, "3"]] | None = None,
 ) -> Connections:
     """The mountings of the cameras and the places of the boards.
 
     **Arguments:** names of cameras and boards; `bodies`: of each board the number of its body;
-    `given`: positions of cameras in the frame of the first, by index, for what a motion leaves
-    open.
+    `given_positions`: positions of cameras in the frame of the first, by index, for what a motion
+    leaves open.
 
     **Raises:** `InputError` if the cameras do not hang together: which ones do, and what would join
     them; `NotSolvedError` if the motion of the rig, which alone could tie them, does not.
@@ -127,15 +127,15 @@ def connect(
         poses = _poses(views, rigs, walls)
         if _join_cameras(poses, views, rigs) or _join_boards(poses, walls, body):
             continue
-        found, open_motions = _find_motion(poses, body, rigs, given or {})
-        if found is None:
+        motion_found, open_motions = _find_motion(poses, body, rigs, given_positions or {})
+        if motion_found is None:
             break
-        (g1, h1), (g2, h2), motion, number = found
-        named = lambda names, rows: tuple(names[i] for i in rows)
+        (g1, h1), (g2, h2), motion, number = motion_found
+        names_of = lambda names, rows: tuple(names[i] for i in rows)
         ties.append(
             MotionTie(
-                (named(cameras, rigs.members(g1)), named(cameras, rigs.members(g2))),
-                (named(boards, walls.members(h1)), named(boards, walls.members(h2))),
+                (names_of(cameras, rigs.members(g1)), names_of(cameras, rigs.members(g2))),
+                (names_of(boards, walls.members(h1)), names_of(boards, walls.members(h2))),
                 number,
                 motion.open.shape[1],
             )
@@ -146,13 +146,13 @@ def connect(
         raise _separate_error(cameras, boards, body, views, rigs, open_motions)
     groups = walls.all()
     separate = [
-        tuple(boards[group[0]] for group in groups if body[group[0]] == one)
-        for one in dict.fromkeys(body.tolist())
+        tuple(boards[group[0]] for group in groups if body[group[0]] == first_board)
+        for first_board in dict.fromkeys(body.tolist())
     ]
-    first = np.linalg.inv(rigs.place[0])
+    to_first_camera = np.linalg.inv(rigs.place[0])
     references = [walls.members(int(group))[0] for group in walls.of]
     return Connections(
-        [place @ first for place in rigs.place],
+        [place @ to_first_camera for place in rigs.place],
         groups,
         [np.linalg.inv(walls.place[r]) @ place for r, place in zip(references, walls.place)],
         tuple(ties),
@@ -160,11 +160,11 @@ def connect(
     )
 
 
-def body_pose(view: BoardView, found: Connections) -> Matrix:
+def body_pose(view: BoardView, connections: Connections) -> Matrix:
     """The pose of a body (frame of its first board → frame of the first camera) that a view of one
     of its boards gives."""
-    rig = np.linalg.inv(found.mountings[view.camera]) @ view.pose
-    return rig @ np.linalg.inv(found.places[view.board])
+    rig = np.linalg.inv(connections.mountings[view.camera]) @ view.pose
+    return rig @ np.linalg.inv(connections.places[view.board])
 
 
 def _poses(views: Iterable[BoardView], rigs: _Groups, walls: _Groups) -> Poses:
@@ -174,43 +174,43 @@ def _poses(views: Iterable[BoardView], rigs: _Groups, walls: _Groups) -> Poses:
         key = int(rigs.of[view.camera]), int(walls.of[view.board]), view.epoch
         if key not in best or view.points > best[key].points:
             best[key] = view
-    found: Poses = defaultdict(dict)
+    poses: Poses = defaultdict(dict)
     for (g, h, epoch), view in best.items():
         pose = np.linalg.inv(rigs.place[view.camera]) @ view.pose
-        found[g, h][epoch] = pose @ np.linalg.inv(walls.place[view.board])
-    return found
+        poses[g, h][epoch] = pose @ np.linalg.inv(walls.place[view.board])
+    return poses
 
 
 def _join_cameras(poses: Poses, views: Sequence[BoardView], rigs: _Groups) -> bool:
     """Join the two groups of cameras that share most epochs; False if none share enough."""
     shared: dict[tuple[int, int], dict[int, Matrix]] = defaultdict(dict)
-    for ((g1, h1), one), ((g2, h2), other) in combinations(sorted(poses.items()), 2):
+    for ((g1, h1), poses_a), ((g2, h2), poses_b) in combinations(sorted(poses.items()), 2):
         if h1 == h2:
-            for e in one.keys() & other.keys():
-                shared[g1, g2][e] = other[e] @ np.linalg.inv(one[e])
+            for e in poses_a.keys() & poses_b.keys():
+                shared[g1, g2][e] = poses_b[e] @ np.linalg.inv(poses_a[e])
     epochs = defaultdict(set)
     for view in views:
         epochs[int(rigs.of[view.camera])].add(view.epoch)
     # A group with fewer epochs in all can share no more: then all of them suffice.
-    enough = {
+    sufficient = {
         pair: relations
         for pair, relations in shared.items()
         if len(relations) >= min(MIN_SHARED_EPOCHS, *(len(epochs[g]) for g in pair))
     }
-    if not enough:
+    if not sufficient:
         return False
-    pair = max(enough, key=lambda pair: len(enough[pair]))
-    _merge_cameras(rigs, *pair, medoid([*enough[pair].values()]))
+    pair = max(sufficient, key=lambda pair: len(sufficient[pair]))
+    _merge_cameras(rigs, *pair, medoid([*sufficient[pair].values()]))
     return True
 
 
 def _join_boards(poses: Poses, walls: _Groups, body: np.ndarray) -> bool:
     """Join the two groups of boards of one body that are seen together at most epochs."""
     shared: dict[tuple[int, int], dict[int, Matrix]] = defaultdict(dict)
-    for ((g1, h1), one), ((g2, h2), other) in combinations(sorted(poses.items()), 2):
+    for ((g1, h1), poses_a), ((g2, h2), poses_b) in combinations(sorted(poses.items()), 2):
         if g1 == g2 and h1 != h2 and body[h1] == body[h2]:
-            for e in one.keys() & other.keys():
-                shared[h1, h2][e] = np.linalg.inv(one[e]) @ other[e]
+            for e in poses_a.keys() & poses_b.keys():
+                shared[h1, h2][e] = np.linalg.inv(poses_a[e]) @ poses_b[e]
     if not shared:
         return False
     pair = max(shared, key=lambda pair: len(shared[pair]))
@@ -218,16 +218,16 @@ def _join_boards(poses: Poses, walls: _Groups, body: np.ndarray) -> bool:
     return True
 
 
-def _merge_cameras(rigs: _Groups, one: int, other: int, change: Matrix) -> None:
+def _merge_cameras(rigs: _Groups, group: int, joined_group: int, change: Matrix) -> None:
     """Give the cameras of a group the frame of another; `change`: from that to theirs."""
-    for k in rigs.members(other):
-        rigs.place[k], rigs.of[k] = rigs.place[k] @ change, one
+    for k in rigs.members(joined_group):
+        rigs.place[k], rigs.of[k] = rigs.place[k] @ change, group
 
 
-def _merge_boards(walls: _Groups, one: int, other: int, change: Matrix) -> None:
+def _merge_boards(walls: _Groups, group: int, joined_group: int, change: Matrix) -> None:
     """Give the boards of a group the frame of another; `change`: from theirs to that."""
-    for j in walls.members(other):
-        walls.place[j], walls.of[j] = change @ walls.place[j], one
+    for j in walls.members(joined_group):
+        walls.place[j], walls.of[j] = change @ walls.place[j], group
 
 
 class _OpenMotion(NamedTuple):
@@ -241,28 +241,39 @@ class _OpenMotion(NamedTuple):
 
 
 def _find_motion(
-    poses: Poses, body: np.ndarray, rigs: _Groups, given: Mapping[int, Float[np.ndarray, "3"]]
+    poses: Poses,
+    body: np.ndarray,
+    rigs: _Groups,
+    given_positions: Mapping[int, Float[np.ndarray, "3"]],
 ) -> tuple[tuple | None, list[_OpenMotion]]:
     """The motion over most epochs that ties two groups of cameras, alone or with a given position,
     None without one; and the motions tried that do not."""
     candidates = []
-    for one, other in combinations(sorted(poses), 2):
-        if one[0] == other[0] or one[1] == other[1] or body[one[1]] != body[other[1]]:
+    for pair_a, pair_b in combinations(sorted(poses), 2):
+        if pair_a[0] == pair_b[0] or pair_a[1] == pair_b[1] or body[pair_a[1]] != body[pair_b[1]]:
             continue
-        epochs = sorted(poses[one].keys() & poses[other].keys())
+        epochs = sorted(poses[pair_a].keys() & poses[pair_b].keys())
         if epochs:
-            candidates.append((one, other, epochs))
+            candidates.append((pair_a, pair_b, epochs))
     open_motions = []
-    for one, other, epochs in sorted(candidates, key=lambda item: -len(item[2])):
+    for pair_a, pair_b, epochs in sorted(candidates, key=lambda item: -len(item[2])):
         motion = None
         if len(epochs) >= MIN_MOTION_EPOCHS:
-            motion = tie_by_motion(*(np.array([poses[p][e] for e in epochs]) for p in (one, other)))
-            known = [k for k in rigs.members(other[0]) if k in given and rigs.of[0] == one[0]]
-            if known and not motion.determined:
-                motion = _shift_to(motion, rigs, known[0], given[known[0]])
-            if known or motion.determined:
-                return (one, other, motion, len(epochs)), open_motions
-        open_motions.append(_OpenMotion(one, other, motion, len(epochs)))
+            motion = tie_by_motion(
+                *(np.array([poses[p][e] for e in epochs]) for p in (pair_a, pair_b))
+            )
+            cameras_given = [
+                k
+                for k in rigs.members(pair_b[0])
+                if k in given_positions and rigs.of[0] == pair_a[0]
+            ]
+            if cameras_given and not motion.determined:
+                motion = _shift_to(
+                    motion, rigs, cameras_given[0], given_positions[cameras_given[0]]
+                )
+            if cameras_given or motion.determined:
+                return (pair_a, pair_b, motion, len(epochs)), open_motions
+        open_motions.append(_OpenMotion(pair_a, pair_b, motion, len(epochs)))
     return None, open_motions
 
 
@@ -271,8 +282,8 @@ def _shift_to(
 ) -> Motion:
     """A motion with its open part such that a camera is at a position in the frame of the first."""
     place = np.linalg.inv(rigs.place[camera])  # its centre in the frame of its group
-    now = rigs.place[0] @ motion.X @ place[:, 3]
-    return motion.shifted(rigs.place[0][:3, :3].T @ (position - now[:3]))
+    present_position = rigs.place[0] @ motion.X @ place[:, 3]
+    return motion.shifted(rigs.place[0][:3, :3].T @ (position - present_position[:3]))
 
 
 def _separate_error(
@@ -285,78 +296,87 @@ def _separate_error(
 ) -> InputError | NotSolvedError:
     """Which cameras hang together, and what would join them."""
     groups = rigs.all()
-    seen = [{v.board for v in views if v.camera in group} for group in groups]
-    named = [list_some([cameras[k] for k in group], 6) for group in groups]
+    boards_seen = [{v.board for v in views if v.camera in group} for group in groups]
+    names_of_groups = [list_some([cameras[k] for k in group], 6) for group in groups]
     parts = "; ".join(
-        f"{names}, which {'sees' if len(group) == 1 else 'see'} {_boards(boards, of)}"
-        for names, group, of in zip(named, groups, seen)
+        f"{names}, which {'sees' if len(group) == 1 else 'see'} {_boards(boards, boards_of_group)}"
+        for names, group, boards_of_group in zip(names_of_groups, groups, boards_seen)
     )
-    said = f"the cameras are in {len(groups)} groups that nothing ties together: {parts}"
+    message = f"the cameras are in {len(groups)} groups that nothing ties together: {parts}"
     number = {int(rigs.of[group[0]]): i for i, group in enumerate(groups)}
-    for found in open_motions:
-        if found.motion is not None:
-            one, other = (named[number[pair[0]]] for pair in (found.one, found.other))
-            reference = cameras[rigs.members(found.one[0])[0]]
-            why = _why_open(found.motion, found.epochs, one, other, reference)
-            return NotSolvedError(f"not solved: {said}. {why}")
-    first, second = _nearest(groups, seen)
-    shared = _common_epochs(views, groups[first], groups[second])
+    for open_motion in open_motions:
+        if open_motion.motion is not None:
+            names_a, names_b = (
+                names_of_groups[number[pair[0]]] for pair in (open_motion.one, open_motion.other)
+            )
+            reference = cameras[rigs.members(open_motion.one[0])[0]]
+            why = _why_open(open_motion.motion, open_motion.epochs, names_a, names_b, reference)
+            return NotSolvedError(f"not solved: {message}. {why}")
+    group_a, group_b = _nearest(groups, boards_seen)
+    shared = _common_epochs(views, groups[group_a], groups[group_b])
     if shared:
         why = f"; they see one board at the same time at {count(shared, 'epoch')} only"
     else:
         why = ""
-    common = seen[first] & seen[second]
-    target = boards[min(common or seen[first])]
-    pair = cameras[groups[first][0]], cameras[groups[second][0]]
+    common = boards_seen[group_a] & boards_seen[group_b]
+    target = boards[min(common or boards_seen[group_a])]
+    pair = cameras[groups[group_a][0]], cameras[groups[group_b][0]]
     board = "the board" if len(boards) == 1 else f"board {target!r}"
     advice = (
         f"photograph {board} with {pair[0]!r} and {pair[1]!r} at the same time, at "
         f"{MIN_SHARED_EPOCHS} epochs or more"
     )
-    moved = {int(body[j]) for j in seen[first]} & {int(body[j]) for j in seen[second]}
+    is_one_body = {int(body[j]) for j in boards_seen[group_a]} & {
+        int(body[j]) for j in boards_seen[group_b]
+    }
     if len(boards) > 1 and not common:
         advice += (
             "; or move the rig so that both see their boards at the same time, with rotations "
             "about two axes"
-            if moved
+            if is_one_body
             else "; or, if their boards are fixed to each other, say so (body of the boards, "
             "--fixed)"
         )
-    return InputError(f"{said}{why}; {advice}")
+    return InputError(f"{message}{why}; {advice}")
 
 
-def _boards(names: Sequence[str], seen: Iterable[int]) -> str:
+def _boards(names: Sequence[str], seen_boards: Iterable[int]) -> str:
     if len(names) == 1:
         return "the board"
-    own = sorted(seen)
-    listed = list_some([names[j] for j in own], 6)
-    return f"board {listed}" if len(own) == 1 else f"boards {listed}"
+    sorted_boards = sorted(seen_boards)
+    listed = list_some([names[j] for j in sorted_boards], 6)
+    return f"board {listed}" if len(sorted_boards) == 1 else f"boards {listed}"
 
 
-def _why_open(motion: Motion, epochs: int, one: str, other: str, reference: str) -> str:
+def _why_open(motion: Motion, epochs: int, group_a: str, group_b: str, reference: str) -> str:
     """What a motion leaves open, and which would not."""
-    common = f"Over the {epochs} epochs that {one} and {other} have in common"
+    common = f"Over the {epochs} epochs that {group_a} and {group_b} have in common"
     if motion.open.shape[1] > 1:
         return (
-            f"{common} the rig is only shifted, not rotated: the position of {other} is not "
+            f"{common} the rig is only shifted, not rotated: the position of {group_b} is not "
             "determined; rotate the rig about two axes as well, or give what is known of the "
             "position (--mountings)"
         )
     axis = ", ".join(f"{x + 0.0:.2f}" for x in motion.open[:, 0].round(2))
     return (
         f"{common} all rotations of the rig are about one axis, ({axis}) in the frame of "
-        f"{reference!r}: the position of {other} along it is not determined; rotate the rig about "
+        f"{reference!r}: the position of {group_b} along it is not determined; rotate the rig "
+        "about "
         "a second axis as well, or give what is known of the position (--mountings)"
     )
 
 
-def _nearest(groups: Sequence[Sequence[int]], seen: Sequence[set[int]]) -> tuple[int, int]:
+def _nearest(groups: Sequence[Sequence[int]], boards_seen: Sequence[set[int]]) -> tuple[int, int]:
     """The two groups that most boards have in common."""
     pairs = combinations(range(len(groups)), 2)
-    return max(pairs, key=lambda pair: len(seen[pair[0]] & seen[pair[1]]))
+    return max(pairs, key=lambda pair: len(boards_seen[pair[0]] & boards_seen[pair[1]]))
 
 
-def _common_epochs(views: Sequence[BoardView], one: Sequence[int], other: Sequence[int]) -> int:
+def _common_epochs(
+    views: Sequence[BoardView], group_a: Sequence[int], group_b: Sequence[int]
+) -> int:
     """Number of epochs at which both groups see the same board."""
-    at = [{(v.board, v.epoch) for v in views if v.camera in group} for group in (one, other)]
-    return len({epoch for _, epoch in at[0] & at[1]})
+    boards_and_epochs = [
+        {(v.board, v.epoch) for v in views if v.camera in group} for group in (group_a, group_b)
+    ]
+    return len({epoch for _, epoch in boards_and_epochs[0] & boards_and_epochs[1]})

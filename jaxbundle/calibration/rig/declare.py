@@ -71,9 +71,9 @@ FLOATING = Motions(
 )
 
 
-def roll_of_stick(stick: Posed, given: Float[Array, "3"]) -> Array:
+def roll_of_stick(stick: Posed, direction: Float[Array, "3"]) -> Array:
     """The axis e_y of a stick, given in the frame of the rig by its rotation, along a given one."""
-    return jnp.asarray(given) @ stick.rotation.matrix()[:, 1]
+    return jnp.asarray(direction) @ stick.rotation.matrix()[:, 1]
 
 
 # Of a stick, which has no rotation about itself: see `wand_body`.
@@ -149,12 +149,12 @@ class Rig:
     def lines(self) -> Float[np.ndarray, " n"]:
         """Of every image point the row of the image relative to the middle one, heights of the
         image."""
-        found = np.zeros(len(self.xy))
+        lines = np.zeros(len(self.xy))
         for k, camera in enumerate(self.cameras):
-            own, size = self.camera == k, not_none(camera.image_size)
-            uv = in_pixels(self.xy[own], get_model(camera.model), size, camera.pixel_size)
-            found[own] = (uv[:, 1] - (size[1] - 1) / 2) / size[1]
-        return found
+            is_of_camera, size = self.camera == k, not_none(camera.image_size)
+            uv = in_pixels(self.xy[is_of_camera], get_model(camera.model), size, camera.pixel_size)
+            lines[is_of_camera] = (uv[:, 1] - (size[1] - 1) / 2) / size[1]
+        return lines
 
     def poses(self, values: Mapping[str, Any]) -> PoseValue:
         """The pose of every epoch, of the values of the tables."""
@@ -185,18 +185,18 @@ class Rig:
 
     def in_order(self, by_set: Mapping[str, Any]) -> Float[np.ndarray, "n 2"]:
         """The engine's results by set of image points, in the order of the rig."""
-        found = np.zeros(self.xy.shape)
+        in_rig_order = np.zeros(self.xy.shape)
         for table, rows in self.sets:
             if len(rows):
-                found[rows] = by_set[table.image_set]
-        return found
+                in_rig_order[rows] = by_set[table.image_set]
+        return in_rig_order
 
 
 def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     """The tables of unknowns and the observations of a rig."""
     # Free points that no camera sees keep their coordinates.
-    seen = np.isin(np.arange(len(rig.points)), rig.point)
-    free = seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
+    is_seen = np.isin(np.arange(len(rig.points)), rig.point)
+    free = is_seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
     free = np.repeat(free[:, None], 3, axis=1)
     if rig.wand is not None:
         # The pose has the other coordinates.
@@ -228,9 +228,11 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
     observations = _image_points(rig)
     observations += _given_mountings(rig)
     if rig.point_sigma is not None:
-        every = np.arange(rig.number_of_board_points)
-        given = rig.points[every]
-        observations.append(CONTROL_POINTS((every,), given, sigma=rig.point_sigma, name="control"))
+        board_points = np.arange(rig.number_of_board_points)
+        given_points = rig.points[board_points]
+        observations.append(
+            CONTROL_POINTS((board_points,), given_points, sigma=rig.point_sigma, name="control")
+        )
     if rig.wand is not None:
         observations += _wand(rig, rig.wand)
     return tables, observations
@@ -238,11 +240,11 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[ObservationSet]]:
 
 def _wand(rig: Rig, wand: RigWand) -> list[ObservationSet]:
     """The known length of a wand, and its rolls."""
-    one, other = np.array([[len(rig.points) - 2], [len(rig.points) - 1]])
+    first_end, second_end = np.array([[len(rig.points) - 2], [len(rig.points) - 1]])
     length, sigma = np.array([wand.length]), np.array([wand.sigma])
     frames = wand.first + np.arange(len(wand.across))
     return [
-        DISTANCES((one, other), length, sigma=sigma, name=WAND_LENGTH),
+        DISTANCES((first_end, second_end), length, sigma=sigma, name=WAND_LENGTH),
         ROLLS((frames,), wand.across, sigma=np.ones(len(frames))),
     ]
 
@@ -267,13 +269,13 @@ def _image_points(rig: Rig) -> list[ObservationSet]:
         if not len(rows):
             continue
         k = rig.camera[rows]
-        touched = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
+        touched_rows = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
         if rig.place is not None:
-            touched = rig.board_of_points[rig.point[rows]], *touched
+            touched_rows = rig.board_of_points[rig.point[rows]], *touched_rows
         poses = POSES if rig.place is None else ON_BODIES
         kind = image_points(table.model, "measured", table.name, poses)
         observations.append(
-            kind(touched, rig.xy[rows], sigma=rig.sigma[rows], name=table.image_set)
+            kind(touched_rows, rig.xy[rows], sigma=rig.sigma[rows], name=table.image_set)
         )
     return observations
 
@@ -284,21 +286,21 @@ def _timed_image_points(rig: Rig, trajectory: TargetMotion) -> list[ObservationS
     observations = []
     for table, rows in rig.sets:
         k, epoch = rig.camera[rows], rig.epoch[rows]
-        first, instant = trajectory.intervals(epoch, line[rows])
-        controls = (first + j for j in range(CONTROLS))
-        touched = (*controls, k, k, np.searchsorted(table.cameras, k), rig.point[rows])
+        first_pose, instant = trajectory.intervals(epoch, line[rows])
+        controls = (first_pose + j for j in range(CONTROLS))
+        touched_rows = (*controls, k, k, np.searchsorted(table.cameras, k), rig.point[rows])
         if board:
-            touched = rig.board_of_points[rig.point[rows]], *touched
+            touched_rows = rig.board_of_points[rig.point[rows]], *touched_rows
         kind = timed_image_points(table.model, "measured", table.name, MOUNTING, board)
         sigma = np.where(unused[rows, None], np.inf, rig.sigma[rows])
         measured = (rig.xy[rows], instant)
-        observations.append(kind(touched, measured, sigma=sigma, name=table.image_set))
+        observations.append(kind(touched_rows, measured, sigma=sigma, name=table.image_set))
     clocks = trajectory.clocks
     sigma = np.where(clocks.free, clocks.prior, np.inf)
     weighted = np.flatnonzero(np.isfinite(sigma).any(1))
     if len(weighted):
-        given = CLOCK_PRIOR((weighted,), clocks.value[weighted], sigma=sigma[weighted])
-        observations.append(given)
+        clock_priors = CLOCK_PRIOR((weighted,), clocks.value[weighted], sigma=sigma[weighted])
+        observations.append(clock_priors)
     return observations
 
 
@@ -315,13 +317,13 @@ def _free_mountings(rig: Rig) -> Float[np.ndarray, "cameras 6"]:
 def _given_mountings(rig: Rig) -> list[ObservationSet]:
     """The observations of what is given of mountings and bases."""
     row = {camera.id: k for k, camera in enumerate(rig.cameras)}
-    known = rig.known.mountings
-    found = observe_mountings([row[name] for name in known], [*known.values()])
+    known_mountings = rig.known.mountings
+    sets = observe_mountings([row[name] for name in known_mountings], [*known_mountings.values()])
     if rig.known.bases:
         ends = np.array([[row[name] for name in base.cameras] for base in rig.known.bases])
         length, sigma = np.array([(base.length, base.sigma) for base in rig.known.bases]).T
-        found.append(BASES(tuple(ends.T), length, sigma=sigma))
-    return found
+        sets.append(BASES(tuple(ends.T), length, sigma=sigma))
+    return sets
 
 
 def adjust_rig(rig: Rig, max_iterations: int = 50, **options: Any) -> Result:
@@ -348,30 +350,32 @@ def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
 
 
 def leave_out(
-    rig: Rig, found: Result, rays: Bool[np.ndarray, " n"], max_iterations: int = 50
+    rig: Rig, result: Result, rays: Bool[np.ndarray, " n"], max_iterations: int = 50
 ) -> Result:
     """The rig adjusted again from its start values without some of its image points; epochs left
     with too few are excluded."""
-    removed = [
+    removed_rows = [
         RemovedRow(table.image_set, row, None, 0.0)
         for table, of_set in rig.sets
         for row in np.flatnonzero(rays[of_set]).tolist()
     ]
-    problem = without(found.problem, removed)
+    problem = without(result.problem, removed_rows)
     return Result(problem, find_minimum(problem, max_steps=max_iterations + 1))
 
 
-def snoop_rig(found: Result, test: str, significance: float, max_iterations: int = 50) -> Result:
+def snoop_rig(result: Result, test: str, significance: float, max_iterations: int = 50) -> Result:
     """The result without blunders found by a test.
 
     **Raises:** `NotSolvedError` if the remaining observations do not determine a solution."""
     # Each round from the last solution: a removed blunder moves it little.
-    minimum = found.minimum
+    minimum = result.minimum
 
-    def again(problem: Problem, values: Any) -> Solution:
+    def adjust_again(problem: Problem, values: Any) -> Solution:
         nonlocal minimum
         minimum = find_minimum(problem, values, max_steps=max_iterations + 1)
         return Result(problem, minimum).solution
 
-    solution, removed = snoop(found.solution, again, test=test, significance=significance)
-    return Result(solution.problem, minimum, removed)
+    solution, removed_rows = snoop(
+        result.solution, adjust_again, test=test, significance=significance
+    )
+    return Result(solution.problem, minimum, removed_rows)

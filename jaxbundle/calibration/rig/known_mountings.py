@@ -32,9 +32,9 @@ class KnownMountings(NamedTuple):
     def positions(self, cameras: Sequence[str]) -> dict[int, Float[np.ndarray, "3"]]:
         """The given positions, by the index of the camera."""
         return {
-            cameras.index(name): one.position
-            for name, one in self.mountings.items()
-            if one.position is not None
+            cameras.index(name): mounting.position
+            for name, mounting in self.mountings.items()
+            if mounting.position is not None
         }
 
 
@@ -59,18 +59,18 @@ def known_mountings(
         section = file.document[SECTION]
         mountings, bases = section.get("mounting", {}), [*section.get("bases", ()), *bases]
     try:
-        found = KnownMountings(
+        known = KnownMountings(
             read_mountings(SECTION, {} if mountings is None else mountings, np.pi / 180),
             read_bases(SECTION, bases),
         )
-        for name in (*found.mountings, *(name for base in found.bases for name in base.cameras)):
+        for name in (*known.mountings, *(name for base in known.bases for name in base.cameras)):
             if name not in cameras:
                 raise InputError(f"no camera {name!r} is given{did_you_mean(name, cameras)}")
-        if cameras[0] in found.mountings:
+        if cameras[0] in known.mountings:
             raise InputError(
                 f"mounting.{cameras[0]}: {cameras[0]!r} is the reference camera, which the others "
                 "are mounted to; give theirs, or another camera first"
             )
     except InputError as error:
         raise InputError(f"{where}{error}") from None
-    return found
+    return known

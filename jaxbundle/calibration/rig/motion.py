@@ -73,10 +73,10 @@ class Motion(NamedTuple):
     def shifted(self, shift: Float[np.ndarray, "3"]) -> "Motion":
         """The same with another translation of X, of which only the open part counts: it moves the
         second boards with the second cameras."""
-        along = self.open @ self.open.T @ shift
+        open_part = self.open @ self.open.T @ shift
         X, Z = self.X.copy(), self.Z.copy()
-        X[:3, 3] += along
-        Z[:3, 3] -= Z[:3, :3] @ self.turn @ along  # u loses what t_X gains
+        X[:3, 3] += open_part
+        Z[:3, 3] -= Z[:3, :3] @ self.turn @ open_part  # u loses what t_X gains
         return self._replace(X=X, Z=Z)
 
 
@@ -88,27 +88,33 @@ def tie_by_motion(A: Float[np.ndarray, "n 4 4"], B: Float[np.ndarray, "n 4 4"]) 
     n, R = len(A), A[:, :3, :3]
     weight, size = np.ones(n), max(float(np.median(np.linalg.norm(A[:, :3, 3], axis=1))), 1e-300)
     for _ in range(REWEIGHTED):
-        found = {number: _solve(A, B, weight, number) for number in (0, 1, 3)}
-        turns = {k: _log(R, X[:3, :3] @ B[:, :3, :3] @ Z[:3, :3]) for k, (X, Z) in found.items()}
+        by_number = {number: _solve(A, B, weight, number) for number in (0, 1, 3)}
+        turns = {
+            k: _log(R, X[:3, :3] @ B[:, :3, :3] @ Z[:3, :3]) for k, (X, Z) in by_number.items()
+        }
         # The median of the length of three errors of σ is 1.54 σ (χ with three degrees of freedom);
         # 6 unknowns are subtracted from the 3n angles. Of rotations about one axis the formulas of
         # any axes have no good solution, and the others less noise.
         lengths = min(float(np.median(np.linalg.norm(turn, axis=1))) for turn in turns.values())
         noise = max(lengths / 1.54 * np.sqrt(3 * n / (3 * n - 6)), ROUNDING)
-        spread, V = _rotations(R, weight)
-        still = int((spread <= SIGNIFICANT * noise).sum())
-        X, Z = found[still if still < 2 else 3]
-        apart = A - X @ B @ Z
-        off = np.linalg.norm(apart[:, :3, :3], axis=(1, 2))
-        off = off + np.linalg.norm(apart[:, :3, 3], axis=1) / size
+        extents, V = _rotations(R, weight)
+        number_of_zero = int((extents <= SIGNIFICANT * noise).sum())
+        X, Z = by_number[number_of_zero if number_of_zero < 2 else 3]
+        misclosure = A - X @ B @ Z
+        size_of_misclosure = np.linalg.norm(misclosure[:, :3, :3], axis=(1, 2))
+        size_of_misclosure = (
+            size_of_misclosure + np.linalg.norm(misclosure[:, :3, 3], axis=1) / size
+        )
         # The sum of distances instead of squares: a wrong epoch pulls no harder than a right one.
-        weight = 1 / np.maximum(off, max(float(np.median(off)), ROUNDING))
+        weight = 1 / np.maximum(
+            size_of_misclosure, max(float(np.median(size_of_misclosure)), ROUNDING)
+        )
         weight = weight / weight.mean()
     mean = np.einsum("e,eij->ij", weight / weight.sum(), R)
     turn = nearest_rotation(mean).T
-    if still == 0:
+    if number_of_zero == 0:
         return Motion(X, Z, np.zeros((3, 0)), turn)
-    if still == 1:
+    if number_of_zero == 1:
         axis = mean @ V[2]
         return Motion(X, Z, (axis / np.linalg.norm(axis))[:, None], turn)
     return Motion(X, Z, np.eye(3), turn)
@@ -121,8 +127,8 @@ def _rotations(
     the frame of the boards: what remains of R_A after its mean acts on u; without it t_X and u are
     one unknown."""
     share = weight / weight.sum()
-    rest = np.sqrt(share)[:, None, None] * (R - np.einsum("e,eij->ij", share, R))
-    _, size, V = np.linalg.svd(rest.reshape(-1, 3))
+    deviation = np.sqrt(share)[:, None, None] * (R - np.einsum("e,eij->ij", share, R))
+    _, size, V = np.linalg.svd(deviation.reshape(-1, 3))
     return size, V
 
 
@@ -147,10 +153,10 @@ def _rotations_of_any_axes(
     A: Float[np.ndarray, "n 4 4"], B: Float[np.ndarray, "n 4 4"], weight: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
     """R_X and R_Zᵀ of rotations about two axes or more."""
-    one = np.eye(3)
+    identity = np.eye(3)
     # vec of rows: vec(R_A·W) = (R_A ⊗ 1)·vec W,  vec(R_X·R_B) = (1 ⊗ R_Bᵀ)·vec R_X.
     rows = [
-        w * np.hstack([np.kron(a[:3, :3], one), -np.kron(one, b[:3, :3].T)])
+        w * np.hstack([np.kron(a[:3, :3], identity), -np.kron(identity, b[:3, :3].T)])
         for w, a, b in zip(np.sqrt(weight), A, B)
     ]
     _, _, V = np.linalg.svd(np.concatenate(rows))
@@ -164,21 +170,21 @@ def _turn_about_axis(
 ) -> Float[np.ndarray, "3 3"]:
     """R_X of rotations about one axis and of shifts."""
     Ra, Rb = A[:, :3, :3], B[:, :3, :3]
-    first = int(weight.argmax())
-    r, q = (_log(R, np.broadcast_to(R[first], R.shape)) for R in (Ra, Rb))
+    heaviest = int(weight.argmax())
+    r, q = (_log(R, np.broadcast_to(R[heaviest], R.shape)) for R in (Ra, Rb))
     R0 = nearest_rotation(np.einsum("e,ei,ej->ij", weight, r, q))
     _, _, V = np.linalg.svd(np.sqrt(weight)[:, None] * r)
     a = V[0]
-    across = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    along, rows, seen = np.outer(a, a), [], []
-    for w, one, other in zip(np.sqrt(weight), A, B):
-        t = R0 @ other[:3, 3]
-        turned = np.stack([t - along @ t, across @ t], 1)
-        rows.append(w * np.hstack([turned, np.eye(3), one[:3, :3]]))
-        seen.append(w * (one[:3, 3] - along @ t))
-    c, s, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(seen), rcond=None)[0]
+    cross_matrix = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    projection, rows, right_sides = np.outer(a, a), [], []
+    for w, pose_a, pose_b in zip(np.sqrt(weight), A, B):
+        t = R0 @ pose_b[:3, 3]
+        columns = np.stack([t - projection @ t, cross_matrix @ t], 1)
+        rows.append(w * np.hstack([columns, np.eye(3), pose_a[:3, :3]]))
+        right_sides.append(w * (pose_a[:3, 3] - projection @ t))
+    c, s, *_ = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right_sides), rcond=None)[0]
     c, s = np.array([c, s]) / max(np.hypot(c, s), 1e-300)
-    return (along + c * (np.eye(3) - along) + s * across) @ R0
+    return (projection + c * (np.eye(3) - projection) + s * cross_matrix) @ R0
 
 
 def _turn_of_shifts(
@@ -199,27 +205,29 @@ def _translations(
     """t_X and u; where they are open, the smallest."""
     root = np.sqrt(weight)
     rows = [w * np.hstack([np.eye(3), a[:3, :3]]) for w, a in zip(root, A)]
-    seen = [w * (a[:3, 3] - R @ b[:3, 3]) for w, a, b in zip(root, A, B)]
-    t, u = np.split(np.linalg.lstsq(np.concatenate(rows), np.concatenate(seen), rcond=None)[0], 2)
+    right_sides = [w * (a[:3, 3] - R @ b[:3, 3]) for w, a, b in zip(root, A, B)]
+    t, u = np.split(
+        np.linalg.lstsq(np.concatenate(rows), np.concatenate(right_sides), rcond=None)[0], 2
+    )
     return t, u
 
 
 def transformation(R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> np.ndarray:
     """The matrix [4, 4] of R·x + t."""
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = R, t
-    return found
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = R, t
+    return matrix
 
 
 def medoid(transformations: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "4 4"]:
     """The transformation nearest to all others: a wrong one does not move it, as it would a mean,
     and it needs no mean of rotations."""
-    found = np.array(transformations)
-    shift, R = found[:, :3, 3], found[:, :3, :3]
+    stack = np.array(transformations)
+    shift, R = stack[:, :3, 3], stack[:, :3, :3]
     size = np.median(np.linalg.norm(shift, axis=1)) + 1e-12
-    apart = np.linalg.norm(R[:, None] - R, axis=(2, 3))
-    apart += np.linalg.norm(shift[:, None] - shift, axis=2) / size
-    return found[int(np.median(apart, axis=1).argmin())]
+    distance = np.linalg.norm(R[:, None] - R, axis=(2, 3))
+    distance += np.linalg.norm(shift[:, None] - shift, axis=2) / size
+    return stack[int(np.median(distance, axis=1).argmin())]
 
 
 def _log(R: Float[np.ndarray, "n 3 3"], S: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:

@@ -47,8 +47,8 @@ class Mounting:
     @property
     def correlation(self) -> Float[np.ndarray, "6 6"]:
         """Correlations of base and ω, φ, κ; 0 of a σ of 0."""
-        over = np.maximum(self.sigma, 1e-300)
-        return self.covariance / over[:, None] / over
+        positive_sigma = np.maximum(self.sigma, 1e-300)
+        return self.covariance / positive_sigma[:, None] / positive_sigma
 
     @property
     def weakest(self) -> tuple[float, Float[np.ndarray, "3"]]:
@@ -73,55 +73,54 @@ def table_of_mountings(mountings: Mapping[str, Mounting]) -> dict[str, np.ndarra
 
 @partial(compile_once, static=0)
 def _to_angles(
-    placed: bool, pose: PoseValue, own: Float[AnyArray, "3"], frame: Float[AnyArray, "3"]
+    placed: bool, pose: PoseValue, own_centroid: Float[AnyArray, "3"], frame: Float[AnyArray, "3"]
 ) -> tuple[Array, Array, Array, Array]:
     """Base, R, ω, φ, κ, and derivatives of base and angles by (δb, δθ).
 
     Of a camera the pose is its mounting: base and R. A board is `placed` by its pose, from its
-    frame to that of its body, relative to the centroids of both, `own` and `frame`: the inverse
-    says where it is.
-    """
+    frame to that of its body, relative to the centroids of both, `own_centroid` and `frame`: the
+    inverse says where it is."""
     block = Pose().prepare(pose)
 
     def place(block: Any) -> tuple[Array, Array]:
         R = block.rotation.matrix()
         if not placed:
             return jnp.stack(block.centre), R
-        return frame - R @ (own + jnp.stack(block.centre)), R.T
+        return frame - R @ (own_centroid + jnp.stack(block.centre)), R.T
 
     base, R = place(block)
     # Angles near the given ones, so that κ does not jump by a full turn in the derivatives.
-    given = omega_phi_kappa_from_matrix(R)
+    angles = omega_phi_kappa_from_matrix(R)
 
     def change(d: Float[Array, "6"]) -> Float[Array, "6"]:
         base, R = place(Pose().move(block, tuple(d)))
-        return jnp.concatenate([base, omega_phi_kappa_near(R, given)])
+        return jnp.concatenate([base, omega_phi_kappa_near(R, angles)])
 
-    return base, R, given, jax.jacfwd(change)(jnp.zeros(POSE))
+    return base, R, angles, jax.jacfwd(change)(jnp.zeros(POSE))
 
 
-def mounting_of(at: PoseValue, C: Float[np.ndarray, "6 6"]) -> Mounting:
+def mounting_of(pose: PoseValue, C: Float[np.ndarray, "6 6"]) -> Mounting:
     """A mounting by its pose and the covariance of (δb, δθ)."""
-    return _with_covariance(_to_angles(False, at, np.zeros(3), np.zeros(3)), C)
+    return _with_covariance(_to_angles(False, pose, np.zeros(3), np.zeros(3)), C)
 
 
 def placement_of(
-    at: PoseValue,
+    pose: PoseValue,
     C: Float[np.ndarray, "6 6"],
-    own: Float[np.ndarray, "3"],
+    own_centroid: Float[np.ndarray, "3"],
     frame: Float[np.ndarray, "3"],
 ) -> Mounting:
     """The place of a board by its pose on its body, with the centroids of the board and of the
     first board of the body, and the covariance of the pose."""
-    return _with_covariance(_to_angles(True, at, own, frame), C)
+    return _with_covariance(_to_angles(True, pose, own_centroid, frame), C)
 
 
-def _with_covariance(found: tuple, C: Float[np.ndarray, "6 6"]) -> Mounting:
-    base, R, angles, J = map(np.asarray, found)
+def _with_covariance(values_and_derivatives: tuple, C: Float[np.ndarray, "6 6"]) -> Mounting:
+    base, R, angles, J = map(np.asarray, values_and_derivatives)
     J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
     # σ of |b|: the variance along b
-    along = base / length if length else np.zeros(3)
+    direction = base / length if length else np.zeros(3)
     C = J @ C @ J.T
     return Mounting(
-        base, R, np.degrees(angles), C, length, float(np.sqrt(along @ C[:3, :3] @ along))
+        base, R, np.degrees(angles), C, length, float(np.sqrt(direction @ C[:3, :3] @ direction))
     )

@@ -21,59 +21,59 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.rig.result import RigCalibration
 
 
-def network_of_views(found: "RigCalibration") -> Network | None:
+def network_of_views(calibration: "RigCalibration") -> Network | None:
     """The photographs of all cameras, tied by mountings (table `rigs`), with the image points that
     were used; None where a network has no words for the rig: several boards, something known of
     the mountings, or cameras that are not synchronised."""
-    rig = found.rig
+    rig = calibration.rig
     if len(rig.boards) > 1 or rig.trajectory or rig.known.mountings or rig.known.bases:
         return None
-    used = found.used
+    is_used = calibration.used
     views, image = np.unique(
-        np.stack([rig.camera, rig.epoch], 1)[used], axis=0, return_inverse=True
+        np.stack([rig.camera, rig.epoch], 1)[is_used], axis=0, return_inverse=True
     )
-    mounting, pose = found.values("mounting"), found.values("epoch")
+    mounting, pose = calibration.values("mounting"), calibration.values("epoch")
     R, M = (
         np.array([np.asarray(matrix_from_quaternion(q)) for q in rows.rotation])
         for rows in (mounting, pose)
     )
     # The rig has its points relative to the centroid of the board.
-    away = not_none(rig.centroids)[0]
-    position = [away + pose.position[e] + M[e].T @ mounting.position[k] for k, e in views]
+    centroid = not_none(rig.centroids)[0]
+    position = [centroid + pose.position[e] + M[e].T @ mounting.position[k] for k, e in views]
     angles = [np.asarray(omega_phi_kappa_from_matrix(R[k] @ M[e])) for k, e in views]
-    ids = [f"{found.names[k]} {rig.epochs[e]}" for k, e in views]
-    seen, point = np.unique(rig.point[used], return_inverse=True)
+    ids = [f"{calibration.names[k]} {rig.epochs[e]}" for k, e in views]
+    seen_points, point = np.unique(rig.point[is_used], return_inverse=True)
     role = "tie" if rig.points_free else "fixed" if rig.point_sigma is None else "control"
-    points = {"id": [rig.ids[p] for p in seen], "role": [role] * len(seen)}
-    points |= dict(zip("XYZ", found.board[seen].T))
+    points = {"id": [rig.ids[p] for p in seen_points], "role": [role] * len(seen_points)}
+    points |= dict(zip("XYZ", calibration.board[seen_points].T))
     if rig.point_sigma is not None:
-        given = rig.points[seen] + away
-        points |= dict(zip("XYZ", given.T)) | {
-            f"s{a}": [rig.point_sigma] * len(seen) for a in "XYZ"
+        given_points = rig.points[seen_points] + centroid
+        points |= dict(zip("XYZ", given_points.T)) | {
+            f"s{a}": [rig.point_sigma] * len(seen_points) for a in "XYZ"
         }
-    names = [found.names[k] for k, _ in views]
+    names = [calibration.names[k] for k, _ in views]
     epochs = [rig.epochs[e] for _, e in views]
     return make_network(
-        [_camera(found, name) for name in found.names],
+        [_camera(calibration, name) for name in calibration.names],
         {"id": ids, "camera": names, **dict(zip(EXTERIOR, np.hstack([position, angles]).T))},
         points,
         {
             "image": [ids[i] for i in image.ravel()],
-            "point": [rig.ids[p] for p in seen[point]],
-            **dict(zip(("x", "y", "sx", "sy"), np.hstack([rig.xy, rig.sigma])[used].T)),
+            "point": [rig.ids[p] for p in seen_points[point]],
+            **dict(zip(("x", "y", "sx", "sy"), np.hstack([rig.xy, rig.sigma])[is_used].T)),
         },
         datum="inner",
         residuals="measured",
-        image_unit=found.image_unit,
-        object_unit=found.object_unit,
+        image_unit=calibration.image_unit,
+        object_unit=calibration.object_unit,
         sigma_origin=UNIT,
         name="rig",
         rigs={"rig": ["rig"] * len(ids), "epoch": epochs, "image": ids},
-        rig={"reference": found.names[0]},
+        rig={"reference": calibration.names[0]},
     )
 
 
-def _camera(found: "RigCalibration", name: str) -> Camera:
+def _camera(calibration: "RigCalibration", name: str) -> Camera:
     """A camera with its adjusted values and the free parameters of the rig."""
-    free = found.rig.cameras[found.names.index(name)].free
-    return dataclasses.replace(found.camera(name), id=name, free=free)
+    free = calibration.rig.cameras[calibration.names.index(name)].free
+    return dataclasses.replace(calibration.camera(name), id=name, free=free)

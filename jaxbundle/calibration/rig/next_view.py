@@ -83,16 +83,20 @@ def _images(
     space = Pose()
 
     def one(pose: PoseValue, X: Array) -> tuple[Array, Array, Array]:
-        at, mounted = space.prepare(pose), space.prepare(mounting)
+        prepared_pose, mounted = space.prepare(pose), space.prepare(mounting)
 
         def image(change: Array, p: Array) -> Array:
-            Y = space.move(at, tuple(change[6:])).ray(tuple(X))
+            Y = space.move(prepared_pose, tuple(change[6:])).ray(tuple(X))
             ray = space.move(mounted, tuple(change[:6])).ray(Y)
             return jnp.stack(project(model, tuple(p), *ray))
 
         zero = jnp.zeros(2 * space.width)
         J = jnp.concatenate(jax.jacfwd(image, (0, 1))(zero, jnp.asarray(p)), 1)
-        return image(zero, jnp.asarray(p)), J, jnp.asarray(mounted.ray(at.ray(tuple(X)))[2])
+        return (
+            image(zero, jnp.asarray(p)),
+            J,
+            jnp.asarray(mounted.ray(prepared_pose.ray(tuple(X)))[2]),
+        )
 
     return jax.vmap(lambda pose: jax.vmap(lambda X: one(pose, X))(points))(poses)
 
@@ -103,40 +107,55 @@ def next_view(
     """The place of a board that would determine the mounting of a camera best; None if no board
     that moves by itself can be seen by it and another one, for the reference, and where cameras
     are not synchronised."""
-    given = rig.rig
-    alone = [b for b, first in enumerate(given.body) if given.body.count(first) == 1]
-    if given.wand is not None:
-        alone = alone[:-1]
-    if given.trajectory is not None or not alone or camera not in rig.mountings:
+    declared_rig = rig.rig
+    single_boards = [
+        b
+        for b, reference_board in enumerate(declared_rig.body)
+        if declared_rig.body.count(reference_board) == 1
+    ]
+    if declared_rig.wand is not None:
+        single_boards = single_boards[:-1]
+    if declared_rig.trajectory is not None or not single_boards or camera not in rig.mountings:
         return None
-    seen = np.bincount(given.board_of_points[given.point], minlength=len(given.boards))
+    points_seen = np.bincount(
+        declared_rig.board_of_points[declared_rig.point], minlength=len(declared_rig.boards)
+    )
     # One board, or the trials would be multiplied: that with most image points.
-    board = max(alone, key=lambda b: seen[b])
-    points = rig.values("point")[given.board_of_points == board]
+    board = max(single_boards, key=lambda b: points_seen[b])
+    points = rig.values("point")[declared_rig.board_of_points == board]
     poses, facts = _places(rig, camera, settings)
     names = list(rig.names)
     C, widths = rig.covariance(*names), [6 + _width(rig, name) for name in names]
     starts = np.cumsum([0, *widths])
     rows, visible = [], []
     for name, start in zip(names, starts):
-        J, J_pose, there = _whitened(rig, name, poses, points, settings)
+        J, J_pose, is_visible = _whitened(rig, name, poses, points, settings)
         wide = np.zeros((*J.shape[:-1], len(C)))
         wide[..., start : start + J.shape[-1]] = J
         rows.append((wide, J_pose))
-        visible.append(there)
+        visible.append(is_visible)
     J, J_pose = (np.concatenate(parts, axis=1) for parts in zip(*rows))
-    there = np.array(visible)
-    own = starts[names.index(camera)] + np.arange(3)
-    before = float(np.sqrt(np.linalg.eigvalsh(C[np.ix_(own, own)])[-1]))
+    is_visible = np.array(visible)
+    columns = starts[names.index(camera)] + np.arange(3)
+    sigma_before = float(np.sqrt(np.linalg.eigvalsh(C[np.ix_(columns, columns)])[-1]))
     best = None
     # Seen by this camera alone, the unknown pose takes all that it says on the mounting.
-    for n in np.flatnonzero(there[names.index(camera)] & (there.sum(0) > 1)):
-        after = _sigma_with(C, J[n], J_pose[n], own)
-        if best is None or after < best.after:
+    for n in np.flatnonzero(is_visible[names.index(camera)] & (is_visible.sum(0) > 1)):
+        sigma_after = _sigma_with(C, J[n], J_pose[n], columns)
+        if best is None or sigma_after < best.after:
             pixel, distance, tilt, roll, pose = facts[n]
-            by = tuple(name for name, sees in zip(names, there[:, n]) if sees)
+            cameras_that_see = tuple(name for name, sees in zip(names, is_visible[:, n]) if sees)
             best = NextView(
-                camera, given.boards[board], pixel, distance, tilt, roll, by, before, after, pose
+                camera,
+                declared_rig.boards[board],
+                pixel,
+                distance,
+                tilt,
+                roll,
+                cameras_that_see,
+                sigma_before,
+                sigma_after,
+                pose,
             )
     return best
 
@@ -149,7 +168,7 @@ def _sigma_with(
     C: Float[np.ndarray, "k k"],
     J: Float[np.ndarray, "n k"],
     J_pose: Float[np.ndarray, "n 6"],
-    own: np.ndarray,
+    columns: np.ndarray,
 ) -> float:
     """σ of the base in its weakest direction with one more photograph of all cameras."""
     # By factors of QR: J_pᵀ·J_p would square the condition of a small board far away.
@@ -157,7 +176,7 @@ def _sigma_with(
     A = J - Q @ (Q.T @ J)
     AC = A @ C
     S = np.eye(len(A)) + AC @ A.T
-    new = C[np.ix_(own, own)] - AC[:, own].T @ np.linalg.solve(S, AC[:, own])
+    new = C[np.ix_(columns, columns)] - AC[:, columns].T @ np.linalg.solve(S, AC[:, columns])
     return float(np.sqrt(max(np.linalg.eigvalsh(new)[-1], 0.0)))
 
 
@@ -171,26 +190,26 @@ def _whitened(
     """Derivatives over σ of the image points of a camera at every place, [n, 2·points, 6 + free
     parameters] and by the pose [n, 2·points, 6], 0 of what it does not see; and whether it counts
     as seen."""
-    k, given = rig.names.index(name), rig.camera(name)
-    model = get_model(given.model)
+    k, camera = rig.names.index(name), rig.camera(name)
+    model = get_model(camera.model)
     mounting = jax.tree.map(lambda x: x[k], rig.values("mounting"))
-    p = np.array(list(given.parameters.values()))
-    xy, J, along = map(np.asarray, _images(model, p, mounting, poses, points))
-    size = np.array(not_none(given.image_size))
-    uv = in_pixels(xy, model, given.image_size, given.pixel_size)
-    inside = ((uv > 0) & (uv < size - 1)).all(-1) & (along < 0) & np.isfinite(J).all((-2, -1))
-    there = inside.mean(1) >= settings.min_part
-    own = rig.rig.camera == k
+    p = np.array(list(camera.parameters.values()))
+    xy, J, depth = map(np.asarray, _images(model, p, mounting, poses, points))
+    size = np.array(not_none(camera.image_size))
+    uv = in_pixels(xy, model, camera.image_size, camera.pixel_size)
+    is_inside = ((uv > 0) & (uv < size - 1)).all(-1) & (depth < 0) & np.isfinite(J).all((-2, -1))
+    is_visible = is_inside.mean(1) >= settings.min_part
+    is_of_camera = rig.rig.camera == k
     # A posteriori, as C is.
-    sigma = rig.sigma0 * np.median(rig.rig.sigma[own], axis=0)
-    J = np.where((inside & there[:, None])[..., None, None], J / sigma[:, None], 0.0)
+    sigma = rig.sigma0 * np.median(rig.rig.sigma[is_of_camera], axis=0)
+    J = np.where((is_inside & is_visible[:, None])[..., None, None], J / sigma[:, None], 0.0)
     J = J.reshape(len(J), -1, J.shape[-1])
     space = rig.result.problem.table(rig.rig.row_of(k)[0]).vector
     free = [*range(6), *(12 + c for c in space.moving)]
     of_mounting = J[..., free]
     if k == 0:  # the reference has no mounting
         of_mounting[..., :6] = 0.0
-    return of_mounting, J[..., 6:12], there
+    return of_mounting, J[..., 6:12], is_visible
 
 
 def _places(
@@ -199,31 +218,34 @@ def _places(
     """Random places of a board before a camera, as poses of the reference camera relative to it,
     with pixel, distance, tilt, roll and the matrix; distances are those of the epochs."""
     random = np.random.default_rng(settings.seed)
-    given, n = rig.camera(camera), settings.number
-    model, size = get_model(given.model), np.array(not_none(given.image_size))
-    p = tuple(given.parameters.values())
+    adjusted_camera, n = rig.camera(camera), settings.number
+    model, size = get_model(adjusted_camera.model), np.array(not_none(adjusted_camera.image_size))
+    p = tuple(adjusted_camera.parameters.values())
     uv = random.uniform(0.15, 0.85, (n, 2)) * size
-    xy = in_model_units(uv, model, given.image_size, given.pixel_size)
+    xy = in_model_units(uv, model, adjusted_camera.image_size, adjusted_camera.pixel_size)
     rays = np.stack(jax.vmap(lambda xy: image_ray(model, p, xy[0], xy[1]))(xy), -1)
     rays = rays / np.linalg.norm(rays, axis=1)[:, None]
-    away = np.linalg.norm(rig.values("epoch").position, axis=1)
-    nearest, farthest = np.quantile(away, [0.05, 0.95]).tolist()
+    distances_of_boards = np.linalg.norm(rig.values("epoch").position, axis=1)
+    nearest, farthest = np.quantile(distances_of_boards, [0.05, 0.95]).tolist()
     distance = random.uniform(nearest, farthest, n)
     tilt, roll = random.uniform(0, settings.max_tilt, n), random.uniform(0, 180, n)
     axis = random.uniform(0, 2 * np.pi, n)
     # The printed side is that which the cameras have seen: +z of the board towards them, or −z.
     faces = np.sign(np.median(_normals(rig)))
-    at = rig.mountings[camera]
-    found = []
+    mounting = rig.mountings[camera]
+    poses = []
     for k in range(n):
         turn = np.array([np.cos(axis[k]), np.sin(axis[k]), 0.0]) * np.radians(tilt[k])
         R = np.asarray(matrix_from_rotation_vector(turn))
         R = R @ np.asarray(matrix_from_rotation_vector(np.radians(roll[k]) * np.eye(3)[2]))
         R = R @ np.diag([1.0, faces, faces])
         # Board to camera, then to the reference camera: Y = Rᵀ·x + b.
-        R, t = at.rotation.T @ R, at.rotation.T @ (distance[k] * rays[k]) + at.base
-        found.append((-R.T @ t, np.asarray(quaternion_from_matrix(R)), transformation(R, t)))
-    position, rotation, pose = (np.array(column) for column in zip(*found))
+        R, t = (
+            mounting.rotation.T @ R,
+            mounting.rotation.T @ (distance[k] * rays[k]) + mounting.base,
+        )
+        poses.append((-R.T @ t, np.asarray(quaternion_from_matrix(R)), transformation(R, t)))
+    position, rotation, pose = (np.array(column) for column in zip(*poses))
     pixels = [(float(u), float(v)) for u, v in uv]
     return PoseValue(position, rotation), list(zip(pixels, distance, tilt, roll, pose))
 

@@ -40,37 +40,39 @@ def views_of_camera(
                     f"{did_you_mean(camera, given)}"
                 )
     _refuse_same_files(given)
-    found = {}
-    for name, one in given.items():
-        own = {b: known for b, known in boards.items() if name in cameras_of.get(b, given)}
+    views = {}
+    for name, source in given.items():
+        boards_of_camera = {
+            b: known_board for b, known_board in boards.items() if name in cameras_of.get(b, given)
+        }
         tell = (
             None
             if progress is None
             else lambda stage, *numbers, name=name: progress(f"{stage} of {name}", *numbers)
         )
         try:
-            found[name] = _views(one, own, boards, tell)
+            views[name] = _views(source, boards_of_camera, boards, tell)
         except InputError as error:
             raise InputError(f"camera {name}: {error}") from None
-    return found, bodies or None
+    return views, bodies or None
 
 
 def require_lists(name: str, given: Any, example: str) -> dict[str, list[str]]:
     """Lists of names by name; none if nothing is given.
 
     **Raises:** `InputError` about another argument."""
-    found = {} if given is None else given
-    good = isinstance(found, Mapping) and all(
+    lists = {} if given is None else given
+    good = isinstance(lists, Mapping) and all(
         isinstance(names, Sequence)
         and not isinstance(names, str)
-        and all(isinstance(one, str) for one in (key, *names))
-        for key, names in found.items()
+        and all(isinstance(entry, str) for entry in (key, *names))
+        for key, names in lists.items()
     )
     if not good:
         raise InputError(
             f"{name} must be lists of names by name, such as {example}, but is {show(given)}"
         )
-    return {key: list(names) for key, names in found.items()}
+    return {key: list(names) for key, names in lists.items()}
 
 
 def _boards_of(
@@ -96,42 +98,49 @@ def _boards_of(
 
 
 def _views(
-    given: Any, own: Mapping[str, Board], boards: Mapping[str, Board], progress: Progress | None
+    source: Any,
+    boards_of_camera: Mapping[str, Board],
+    boards: Mapping[str, Board],
+    progress: Progress | None,
 ) -> BoardViews | Calibration:
     """The views of one camera."""
-    if isinstance(given, BoardViews | Calibration):
-        return given
-    if isinstance(given, Mapping):
-        return join_views(_require_views(given))
-    files = [given] if isinstance(given, str | Path) else given
+    if isinstance(source, BoardViews | Calibration):
+        return source
+    if isinstance(source, Mapping):
+        return join_views(_require_views(source))
+    files = [source] if isinstance(source, str | Path) else source
     if not isinstance(files, Sequence):
         raise InputError(
             "photographs must be files, patterns or folders, BoardViews, or a Calibration, but are "
-            f"{show(given)}"
+            f"{show(source)}"
         )
     if not boards:
         raise InputError("give the board, or the boards, that are in the photographs")
-    if not own:
+    if not boards_of_camera:
         raise InputError("no board is to be seen by this camera; give one (cameras of the boards)")
     try:
-        if len(own) > 1:
-            return measure_board_set(files, own, progress)
-        ((name, board),) = own.items()
+        if len(boards_of_camera) > 1:
+            return measure_board_set(files, boards_of_camera, progress)
+        ((name, board),) = boards_of_camera.items()
         views = measure_boards(files, board, progress, one_size=True)
         return views if len(boards) == 1 else join_views({name: views})
     except InputError as error:
-        others = {name: one for name, one in boards.items() if name not in own}
-        if (seen := _sees(files, others)) is None:
+        other_boards = {
+            name: other_board
+            for name, other_board in boards.items()
+            if name not in boards_of_camera
+        }
+        if (board_seen := _sees(files, other_boards)) is None:
             raise
         raise InputError(
-            f"{error}. But they show board {seen!r}, which other cameras are to see: are the "
+            f"{error}. But they show board {board_seen!r}, which other cameras are to see: are the "
             "folders swapped? Give the folders, or the cameras of the boards, in the right order"
         ) from None
 
 
-def _sees(files: Sequence[str | Path], others: Mapping[str, Board]) -> str | None:
+def _sees(files: Sequence[str | Path], other_boards: Mapping[str, Board]) -> str | None:
     """A board that the photographs show, of those that are not to be there."""
-    for name, board in others.items():
+    for name, board in other_boards.items():
         try:
             measure_boards(photographs(files)[:MAX_LOOKED_AT], board)
         except InputError:
@@ -145,26 +154,31 @@ def _sees(files: Sequence[str | Path], others: Mapping[str, Board]) -> str | Non
 MAX_LOOKED_AT = 5
 
 
-def _require_views(given: Mapping[Any, Any]) -> Mapping[str, BoardViews]:
-    for name, one in given.items():
-        if not isinstance(one, BoardViews):
-            raise InputError(f"views of board {show(name)} are {show(one)}; expected BoardViews")
-    return given
+def _require_views(views_by_board: Mapping[Any, Any]) -> Mapping[str, BoardViews]:
+    for name, views in views_by_board.items():
+        if not isinstance(views, BoardViews):
+            raise InputError(f"views of board {show(name)} are {show(views)}; expected BoardViews")
+    return views_by_board
 
 
-def _refuse_same_files(given: Mapping[str, Any]) -> None:
+def _refuse_same_files(sources: Mapping[str, Any]) -> None:
     """Refuse a folder that is given for two cameras."""
     owner: dict[Path, str] = {}
-    for name, one in given.items():
-        if isinstance(one, BoardViews | Calibration | Mapping):
+    for name, photographs_of_camera in sources.items():
+        if isinstance(photographs_of_camera, BoardViews | Calibration | Mapping):
             continue
-        files = [one] if isinstance(one, str | Path) else one
+        files = (
+            [photographs_of_camera]
+            if isinstance(photographs_of_camera, str | Path)
+            else photographs_of_camera
+        )
         if not isinstance(files, Sequence):
             continue
         for path in photographs(files):
-            other = owner.setdefault(path.resolve(), name)
-            if other != name:
+            earlier_name = owner.setdefault(path.resolve(), name)
+            if earlier_name != name:
                 raise InputError(
-                    f"{path} is given for camera {other!r} and for camera {name!r}; expected "
+                    f"{path} is given for camera {earlier_name!r} and for camera {name!r}; "
+                    "expected "
                     "photographs of its own for each camera: one folder a camera"
                 )

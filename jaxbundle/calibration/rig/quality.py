@@ -58,8 +58,8 @@ def _slopes(
         def image(
             change: Float[Array, "6"], p: Float[AnyArray, " parameters"]
         ) -> Float[Array, "2"]:
-            moved = space.move(block, (*(nearness * change[:3]), *change[3:]))
-            return jnp.stack(project(model, tuple(p), *moved.ray(ray)))
+            moved_block = space.move(block, (*(nearness * change[:3]), *change[3:]))
+            return jnp.stack(project(model, tuple(p), *moved_block.ray(ray)))
 
         return jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(space.width), p), 1)
 
@@ -84,11 +84,11 @@ def rig_uncertainty(
     if not distance > 0:
         raise InputError(f"distance {distance:g}: expected a positive distance")
     k = _index(rig, name)
-    given, space = rig.camera(name), rig.result.problem.table(rig.rig.row_of(k)[0]).vector
-    model = get_model(given.model)
-    p = np.array(list(given.parameters.values()))
-    uv = grid_of(not_none(given.image_size), *grid)
-    xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
+    camera, space = rig.camera(name), rig.result.problem.table(rig.rig.row_of(k)[0]).vector
+    model = get_model(camera.model)
+    p = np.array(list(camera.parameters.values()))
+    uv = grid_of(not_none(camera.image_size), *grid)
+    xy = in_model_units(uv.reshape(-1, 2), model, camera.image_size, camera.pixel_size)
     C = rig.covariance(name)
     if frame == "rig":
         mounting = jax.tree.map(lambda x: x[k], rig.values("mounting"))
@@ -96,18 +96,18 @@ def rig_uncertainty(
         J = J[:, :, [*range(Pose.width), *(Pose.width + c for c in space.moving)]]
         C = J @ C @ J.swapaxes(1, 2)
     else:
-        own = C[Pose.width :, Pose.width :]
-        C = interior_covariance_of_images(model, p, space.moving, own, xy, frame)
-    per_unit = 1 / np.array(unit_size(model, given.pixel_size))
+        covariance_of_interior = C[Pose.width :, Pose.width :]
+        C = interior_covariance_of_images(model, p, space.moving, covariance_of_interior, xy, frame)
+    per_unit = 1 / np.array(unit_size(model, camera.pixel_size))
     C = C * per_unit[:, None] * per_unit
     return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
 
 
 def rig_points(rig: "RigCalibration", name: str) -> Float[np.ndarray, "n 2"]:
     """The image points of a camera used in the rig adjustment, pixels [n, 2]."""
-    own, given = rig.used & (rig.rig.camera == _index(rig, name)), rig.camera(name)
-    model = get_model(given.model)
-    return in_pixels(rig.rig.xy[own], model, given.image_size, given.pixel_size)
+    is_of_camera, camera = rig.used & (rig.rig.camera == _index(rig, name)), rig.camera(name)
+    model = get_model(camera.model)
+    return in_pixels(rig.rig.xy[is_of_camera], model, camera.image_size, camera.pixel_size)
 
 
 def rig_coverage(rig: "RigCalibration", name: str) -> Coverage:

@@ -54,10 +54,12 @@ def rig_text(rig: "RigCalibration") -> str:
     for name in rig.names:
         lines += heading(f"Camera {clean(name)} in the rig")
         lines += table(("parameter", "value", "σ"), rig_parameter_rows(rig, name), "lrr")
-        said = coverage_in_words(rig.coverage(name))
+        coverage_words = coverage_in_words(rig.coverage(name))
         lines += [
             "",
-            *paragraph(f"{said.capitalize()}. Uncertainty of a projected point (σ, pixels):"),
+            *paragraph(
+                f"{coverage_words.capitalize()}. Uncertainty of a projected point (σ, pixels):"
+            ),
         ]
         lines += table(MAPS_HEADER, map_rows(rig.reported_maps(name), unit), "lrr")
     # Residuals with |τ| above 3 are listed: one in 370 without blunders.
@@ -92,42 +94,45 @@ def _wand_facts(rig: "RigCalibration", unit: str) -> list[tuple[str, str]]:
     if rig.rig.wand is None or rig.wand_length is None:
         return []
     value, sigma = estimate(*rig.wand_length)
-    gone = any(item.kind == "distance" for item in rig.removed)
-    given = f"{rig.rig.wand.length:g} was given" + ", which contradicts the boards" * gone
+    is_removed = any(item.kind == "distance" for item in rig.removed)
+    given_length = (
+        f"{rig.rig.wand.length:g} was given" + ", which contradicts the boards" * is_removed
+    )
     frames = count(len(rig.rig.wand.across), "frame")
     of_boards = rig.rig.epoch < rig.rig.wand.first
     views = np.unique(np.stack([rig.rig.epoch, rig.rig.camera], 1)[of_boards], axis=0)
-    together = np.bincount(views[:, 0]).max(initial=0) > 1
-    alone = "" if together else "; no board is seen by two cameras at the same time"
-    return [("Wand", f"{value} ± {sigma} {unit}, {given}; {frames}{alone}")]
+    are_shared = np.bincount(views[:, 0]).max(initial=0) > 1
+    remark = "" if are_shared else "; no board is seen by two cameras at the same time"
+    return [("Wand", f"{value} ± {sigma} {unit}, {given_length}; {frames}{remark}")]
 
 
 def _tied_facts(rig: "RigCalibration") -> list[tuple[str, str]]:
     """Which boards are fixed to each other, and which cameras only the motion of the rig ties."""
     words = lambda names: ", ".join(map(clean, names))
-    found = [("Fixed to each other", words(body)) for body in rig.bodies if len(body) > 1]
+    tied = [("Fixed to each other", words(body)) for body in rig.bodies if len(body) > 1]
     for tie in rig.ties:
-        (one, other), (first, second) = tie.cameras, tie.boards
-        left = f"; {count(tie.open, 'direction')} left open" if tie.open else ""
-        found.append(
+        (cameras_a, cameras_b), (boards_a, boards_b) = tie.cameras, tie.boards
+        open_directions = f"; {count(tie.open, 'direction')} left open" if tie.open else ""
+        tied.append(
             (
                 "Tied by motion",
-                f"{words(one)} ({words(first)}) and {words(other)} ({words(second)}), "
-                f"{tie.epochs} epochs{left}",
+                f"{words(cameras_a)} ({words(boards_a)}) and {words(cameras_b)} "
+                f"({words(boards_b)}), "
+                f"{tie.epochs} epochs{open_directions}",
             )
         )
-    return found
+    return tied
 
 
 def mounting_titles(rig: "RigCalibration") -> dict[str, "Mounting"]:
     """The mountings and the places of the boards by whose they are, and in whose frame."""
-    found = {
+    titles = {
         f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}": mounting
         for name, mounting in rig.mountings.items()
     }
-    first = {name: body[0] for body in rig.bodies for name in body}
-    return found | {
-        f"Board {clean(name)} in the frame of board {clean(first[name])}": place
+    first_board = {name: body[0] for body in rig.bodies for name in body}
+    return titles | {
+        f"Board {clean(name)} in the frame of board {clean(first_board[name])}": place
         for name, place in rig.placements.items()
     }
 
@@ -145,8 +150,10 @@ def mounting_rows(m: "Mounting", unit: str) -> list[tuple[str, str, str, str]]:
     """Base and angles of a mounting: name, value, σ, unit."""
     units = [unit] * 3 + ["deg"] * 3
     rows = [
-        (label, *estimate(value, sigma), what)
-        for label, value, sigma, what in zip(MOUNTED, [*m.base, *m.angles], m.sigma, units)
+        (label, *estimate(value, sigma), unit_of_number)
+        for label, value, sigma, unit_of_number in zip(
+            MOUNTED, [*m.base, *m.angles], m.sigma, units
+        )
     ]
     return [*rows, ("length", *estimate(m.length, m.length_sigma), unit)]
 
@@ -207,8 +214,8 @@ def _correlated_sigma(rig: "RigCalibration", camera: str, parameter: str) -> dic
 def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
     """The rig as plain dicts and numbers: object unit, degrees, pixels; residuals, in the unit of
     the models, as of `adjust`; `brief` leaves them out."""
-    found = {} if brief else rig.residuals
-    residuals = [dict(zip(found, row)) for row in table_rows(found)]
+    residual_columns = {} if brief else rig.residuals
+    residuals = [dict(zip(residual_columns, row)) for row in table_rows(residual_columns)]
     return {
         "reference": rig.names[0],
         "epochs": list(rig.epochs),

@@ -101,8 +101,8 @@ class RigCalibration(TableMethods):
     @property
     def _stays(self) -> list[bool]:
         """Which poses were not excluded."""
-        gone = dict(self.left_out)
-        return [epoch not in gone for epoch in self.rig.epochs]
+        excluded = dict(self.left_out)
+        return [epoch not in excluded for epoch in self.rig.epochs]
 
     @property
     def converged(self) -> bool:
@@ -134,19 +134,25 @@ class RigCalibration(TableMethods):
     @functools.cached_property
     def rms(self) -> dict[str, float]:
         """√(Σ|v|²/points) in pixels, by camera."""
-        v, found = self.rig.in_order(self.result.solution.residuals) * self.rig.sigma, {}
+        v, rms_of = self.rig.in_order(self.result.solution.residuals) * self.rig.sigma, {}
         for k, name in enumerate(self.names):
-            given = self.rig.cameras[k]
-            own = v[self.used & (self.rig.camera == k)]
-            own = own / np.array(unit_size(get_model(given.model), given.pixel_size))
-            found[name] = float(np.sqrt((own**2).sum(1).mean()))
-        return found
+            camera = self.rig.cameras[k]
+            residuals_of_camera = v[self.used & (self.rig.camera == k)]
+            residuals_of_camera = residuals_of_camera / np.array(
+                unit_size(get_model(camera.model), camera.pixel_size)
+            )
+            rms_of[name] = float(np.sqrt((residuals_of_camera**2).sum(1).mean()))
+        return rms_of
 
     @functools.cached_property
     def residuals(self) -> dict[str, np.ndarray]:
         """One row per observation: kind, image (camera and epoch), point, axis, unit, v, sigma (a
         priori), r, w (Baarda), tau (Pope), mdb, external."""
-        rig, found, weight = self.rig, self.result.solution.reliability, self.result.problem.weights
+        rig, reliability, weight = (
+            self.rig,
+            self.result.solution.reliability,
+            self.result.problem.weights,
+        )
         ids = np.array(rig.ids, dtype=object)
         photographs = [self._photograph(*row) for row in zip(rig.camera, rig.epoch)]
         rows = rig.in_order
@@ -157,7 +163,7 @@ class RigCalibration(TableMethods):
                 ids[rig.point],
                 ("x", "y"),
                 rows({table.image_set: weight(table.image_set) for table, _ in rig.sets}),
-                tuple(rows(getattr(found, name)) for name in result_tables.TESTED),
+                tuple(rows(getattr(reliability, name)) for name in result_tables.TESTED),
                 [(1.0, self.image_unit)] * 2,
             )
         ]
@@ -170,7 +176,7 @@ class RigCalibration(TableMethods):
                     ids[: len(blank)],
                     tuple("XYZ"),
                     weight("control"),
-                    tuple(getattr(found, name)["control"] for name in result_tables.TESTED),
+                    tuple(getattr(reliability, name)["control"] for name in result_tables.TESTED),
                     [(1.0, self.object_unit)] * 3,
                 )
             )
@@ -188,23 +194,25 @@ class RigCalibration(TableMethods):
     @property
     def removed(self) -> list[Removed]:
         """Observations removed by data snooping."""
-        rig, found = self.rig, []
+        rig, removals = self.rig, []
         rows_of = {table.image_set: rows for table, rows in rig.sets}
         for item in self.result.removed:
             if item.set == "control":
                 axis = not_none(item.residual)  # coordinates are tested individually
                 name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
-                found.append(Removed("control", 3 * item.row + axis, name, item.test))
+                removals.append(Removed("control", 3 * item.row + axis, name, item.test))
                 continue
             if item.set == WAND_LENGTH:
-                found.append(Removed("distance", item.row, "the length of the wand", item.test))
+                removals.append(Removed("distance", item.row, "the length of the wand", item.test))
                 continue
             rows = rows_of[item.set][list(item.rows)]
-            seen = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
-            names = [f"point {rig.ids[p]} in image {self._photograph(k, e)}" for p, k, e in seen]
-            others = tuple(rows[1:].tolist())
-            found.append(Removed("image", int(rows[0]), either_of(names), item.test, others))
-        return found
+            removed_rows = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
+            names = [
+                f"point {rig.ids[p]} in image {self._photograph(k, e)}" for p, k, e in removed_rows
+            ]
+            other_rows = tuple(rows[1:].tolist())
+            removals.append(Removed("image", int(rows[0]), either_of(names), item.test, other_rows))
+        return removals
 
     @property
     def board(self) -> Float[np.ndarray, "points 3"]:
@@ -238,12 +246,12 @@ class RigCalibration(TableMethods):
     @functools.cached_property
     def parameters(self) -> dict[str, dict[str, float]]:
         """Parameters of every camera by name."""
-        found = {}
+        by_camera = {}
         for k, name in enumerate(self.names):
             table, row = self.rig.row_of(k)
             names = get_model(self.rig.cameras[k].model).parameters
-            found[name] = dict(zip(names, self.values(table)[row].tolist()))
-        return found
+            by_camera[name] = dict(zip(names, self.values(table)[row].tolist()))
+        return by_camera
 
     @functools.cached_property
     def sigma(self) -> dict[str, dict[str, float]]:
@@ -259,26 +267,26 @@ class RigCalibration(TableMethods):
     def stated_sigma(self) -> dict[str, dict[str, float]]:
         """The larger of both, which is shown."""
         return {
-            name: {n: max(s, self.correlated_sigma[name][n]) for n, s in found.items()}
-            for name, found in self.sigma.items()
+            name: {n: max(s, self.correlated_sigma[name][n]) for n, s in sigma_of_camera.items()}
+            for name, sigma_of_camera in self.sigma.items()
         }
 
     def _sigma(self, classical: bool) -> dict[str, dict[str, float]]:
-        found = {}
+        by_camera = {}
         for k, name in enumerate(self.names):
             table = self.result.problem.table(self.rig.row_of(k)[0])
             C = self.covariance(name, classical=classical)
             sigma = np.sqrt(np.clip(np.diagonal(C)[POSE:], 0, None)).tolist()
             free = self.rig.cameras[k].free
-            found[name] = {n: s for n, s in zip(table.parameters, sigma) if n in free}
-        return found
+            by_camera[name] = {n: s for n, s in zip(table.parameters, sigma) if n in free}
+        return by_camera
 
     @functools.cached_property
     def error_model(self) -> ErrorModel | None:
         """Errors that image points share, if they were looked for in the cameras by themselves;
         None where they cannot be found."""
-        settings = [one.adjustment.correlations for one in self.cameras.values()]
-        if not self.converged or any(one is None for one in settings):
+        settings = [calibration.adjustment.correlations for calibration in self.cameras.values()]
+        if not self.converged or any(calibration is None for calibration in settings):
             return None
         return rig_errors(self.rig, self.result.solution, not_none(settings[0]))
 
@@ -325,12 +333,12 @@ class RigCalibration(TableMethods):
         return self._mountings(classical=True)
 
     def _mountings(self, classical: bool) -> dict[str, Mounting]:
-        found = {}
+        mountings = {}
         for k, name in enumerate(self.names[1:], 1):
-            at = jax.tree.map(lambda x, k=k: x[k], self.values("mounting"))
+            pose = jax.tree.map(lambda x, k=k: x[k], self.values("mounting"))
             C = self.covariance(name, classical=classical)
-            found[name] = mounting_of(at, C[:POSE, :POSE])
-        return found
+            mountings[name] = mounting_of(pose, C[:POSE, :POSE])
+        return mountings
 
     @functools.cached_property
     def placements(self) -> dict[str, Mounting]:
@@ -346,10 +354,10 @@ class RigCalibration(TableMethods):
                 jax.tree.map(lambda x, j=j: x[j], values),
                 covariance[j],
                 centroids[j],
-                centroids[first],
+                centroids[first_board],
             )
-            for j, (name, first) in enumerate(zip(self.rig.boards, self.rig.body))
-            if first != j
+            for j, (name, first_board) in enumerate(zip(self.rig.boards, self.rig.body))
+            if first_board != j
         }
 
     @property
@@ -357,8 +365,12 @@ class RigCalibration(TableMethods):
         """The boards that are fixed to each other, of one body each; the first is its frame."""
         boards = self.rig.boards
         return [
-            tuple(name for name, of in zip(boards, self.rig.body) if of == first)
-            for first in dict.fromkeys(self.rig.body)
+            tuple(
+                name
+                for name, body_of_board in zip(boards, self.rig.body)
+                if body_of_board == first_board
+            )
+            for first_board in dict.fromkeys(self.rig.body)
         ]
 
     @functools.cached_property
@@ -375,10 +387,10 @@ class RigCalibration(TableMethods):
 
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""
-        given = self.rig.cameras[self.names.index(name)]
+        declared_camera = self.rig.cameras[self.names.index(name)]
         if name in self.cameras:
-            given = self.cameras[name].camera
-        return dataclasses.replace(given, parameters=self.parameters[name])
+            declared_camera = self.cameras[name].camera
+        return dataclasses.replace(declared_camera, parameters=self.parameters[name])
 
     def network(self) -> Network:
         """The cameras on their mountings as a network of one image each, the reference at the
@@ -388,8 +400,8 @@ class RigCalibration(TableMethods):
         return network_of_rig(
             Path("rig"),
             cameras,
-            [np.eye(3), *(one.rotation for one in mountings)],
-            [np.zeros(3), *(one.base for one in mountings)],
+            [np.eye(3), *(mounting.rotation for mounting in mountings)],
+            [np.zeros(3), *(mounting.base for mounting in mountings)],
         )
 
     @property
@@ -397,12 +409,12 @@ class RigCalibration(TableMethods):
         """The median distance of the boards from the reference camera, object unit."""
         stays = np.flatnonzero(self._stays)
         if self.rig.place is None:
-            away = self.values("epoch").position[stays]
+            relative_position = self.values("epoch").position[stays]
         else:
             rows = np.stack([self.rig.epoch, self.rig.board_of_points[self.rig.point]], 1)
             epoch, board = np.unique(rows[np.isin(self.rig.epoch, stays)], axis=0).T
-            away = self.values("epoch").position[epoch] - self._centres[board]
-        return float(np.median(np.linalg.norm(away, axis=1)))
+            relative_position = self.values("epoch").position[epoch] - self._centres[board]
+        return float(np.median(np.linalg.norm(relative_position, axis=1)))
 
     @property
     def _centres(self) -> Float[np.ndarray, "boards 3"]:
@@ -427,13 +439,13 @@ class RigCalibration(TableMethods):
 
     def reported_maps(self, name: str) -> list[UncertaintyMap]:
         """At the distance of the board, at ten times that, at infinity; and without mounting."""
-        chosen = (
+        frames_and_distances = (
             ("rig", self.distance),
             ("rig", 10 * self.distance),
             ("rig", np.inf),
             ("rotation", np.inf),
         )
-        return [self.uncertainty(name, distance, frame) for frame, distance in chosen]
+        return [self.uncertainty(name, distance, frame) for frame, distance in frames_and_distances]
 
     def plot_coverage(self, name: str, ax: "Axes | None" = None) -> "Axes":
         """Coverage of the image of a camera by points of the rig; matplotlib axes."""
@@ -444,9 +456,9 @@ class RigCalibration(TableMethods):
         self, name: str, distance: float = np.inf, frame: str = "rig", ax: "Axes | None" = None
     ) -> "Axes":
         """σ of a projected point over the image of a camera; matplotlib axes."""
-        found = self.uncertainty(name, distance, frame, DRAWN)
+        uncertainty = self.uncertainty(name, distance, frame, DRAWN)
         size = not_none(self.camera(name).image_size)
-        return plotting.uncertainty_image(found, size, self.object_unit, name, ax)
+        return plotting.uncertainty_image(uncertainty, size, self.object_unit, name, ax)
 
     def report(self) -> str:
         """The full report as text."""
@@ -473,7 +485,7 @@ class RigCalibration(TableMethods):
         for name, m in self.mountings.items():
             lines.append(f"{name}: base {m.length:.6g} ± {m.length_sigma:.2g}")
         for name, clock in self.clocks.items():
-            lines += [f"clock of {name}: {said}" for said in clock.in_words()]
+            lines += [f"clock of {name}: {sentence}" for sentence in clock.in_words()]
         return "\n".join(lines)
 
 

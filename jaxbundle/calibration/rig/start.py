@@ -52,9 +52,9 @@ class RigBoards:
 
     def rows_of(self, name: str) -> np.ndarray:
         """The rows of the points of a board among all."""
-        sizes = [len(one.ids) for one in self.boards.values()]
-        first = int(np.sum(sizes[: list(self.boards).index(name)], initial=0))
-        return first + np.arange(len(self.boards[name].ids))
+        sizes = [len(board.ids) for board in self.boards.values()]
+        first_row = int(np.sum(sizes[: list(self.boards).index(name)], initial=0))
+        return first_row + np.arange(len(self.boards[name].ids))
 
 
 # By the name of a camera, of every photograph its epoch.
@@ -84,20 +84,21 @@ def collect_boards(
     **Raises:** `InputError` if boards of one name differ, or a body has a board that there is not.
     """
     boards: dict[str, Board] = {}
-    for camera, one in calibrations.items():
-        if isinstance(one.views.board, BoardSet):
-            for name, board in one.views.board.items:
+    for camera, calibration in calibrations.items():
+        if isinstance(calibration.views.board, BoardSet):
+            for name, board in calibration.views.board.items:
                 if boards.setdefault(name, board) != board:
                     raise InputError(
                         f"camera {camera!r}: board {name!r} is {board}, of another camera "
                         f"{boards[name]}; give boards that differ different names"
                     )
-    alone = [
-        one.views.board
-        for one in calibrations.values()
-        if isinstance(one.views.board, Board) and one.views.board not in boards.values()
+    unnamed_boards = [
+        calibration.views.board
+        for calibration in calibrations.values()
+        if isinstance(calibration.views.board, Board)
+        and calibration.views.board not in boards.values()
     ]
-    different = list(dict.fromkeys(alone))
+    different = list(dict.fromkeys(unnamed_boards))
     for number, board in enumerate(different, 1):
         boards["board" if len(different) == 1 and not boards else f"board {number}"] = board
     body = {name: "all boards" if fixed else name for name in boards}
@@ -124,11 +125,12 @@ def keys_by_name(calibrations: Mapping[str, Calibration]) -> Keys:
     **Raises:** `InputError` if the photographs cannot be paired by their names.
     """
     photographs = {
-        name: tuple(dict.fromkeys(one.views.photographs)) for name, one in calibrations.items()
+        name: tuple(dict.fromkeys(calibration.views.photographs))
+        for name, calibration in calibrations.items()
     }
     return {
-        name: dict(zip(photographs[name], own))
-        for name, own in epoch_keys(photographs, connected=False).items()
+        name: dict(zip(photographs[name], keys_of_camera))
+        for name, keys_of_camera in epoch_keys(photographs, connected=False).items()
     }
 
 
@@ -136,17 +138,21 @@ def sort_views(
     calibrations: Mapping[str, Calibration], boards: RigBoards, keys: Keys
 ) -> list[CameraViews]:
     """Board and epoch of every view of every camera."""
-    found = []
-    for name, one in calibrations.items():
-        views = one.views
+    views_of_cameras = []
+    for name, calibration in calibrations.items():
+        views = calibration.views
         if isinstance(views.board, BoardSet):
-            named = [views.board.names[b] for b in views.board.seen(views.visible)]
+            board_names = [views.board.names[b] for b in views.board.seen(views.visible)]
             rows = np.concatenate([boards.rows_of(board) for board in views.board.names])
         else:
-            board = next(n for n, known in boards.boards.items() if known == views.board)
-            named, rows = [board] * len(views), boards.rows_of(board)
-        found.append(CameraViews(one, named, [keys[name][p] for p in views.photographs], rows))
-    return found
+            board = next(
+                n for n, declared_board in boards.boards.items() if declared_board == views.board
+            )
+            board_names, rows = [board] * len(views), boards.rows_of(board)
+        views_of_cameras.append(
+            CameraViews(calibration, board_names, [keys[name][p] for p in views.photographs], rows)
+        )
+    return views_of_cameras
 
 
 def start_rig(
@@ -175,38 +181,41 @@ def start_rig(
     names, views = list(boards.boards), board_views(cameras, boards, epochs)
     body = list(dict.fromkeys(boards.body.values()))
     numbers = [body.index(boards.body[name]) for name in names]
-    others = {} if wand is None else wand.cameras
-    of_rig = [*calibrations, *others]
-    given = known.positions(of_rig)
+    wand_cameras = {} if wand is None else wand.cameras
+    of_rig = [*calibrations, *wand_cameras]
+    given_positions = known.positions(of_rig)
     if wand is None:
-        found = connect(of_rig, names, numbers, views, given)
+        connections = connect(of_rig, names, numbers, views, given_positions)
     else:
         ties = wand.views(of_rig, len(names), len(epochs))
         all_numbers = [*numbers, len(body)]
-        found = connect(of_rig, [*names, "wand"], all_numbers, [*views, *ties], given)
+        connections = connect(
+            of_rig, [*names, "wand"], all_numbers, [*views, *ties], given_positions
+        )
     if nearly is not None:
         # Relations are known now; of a motion each photograph has a time and so a pose of its own.
         cameras = sort_views(calibrations, boards, keys_of_photographs(calibrations))
         epochs = epochs_of(cameras)
         views = board_views(cameras, boards, epochs)
-    reference = [next(g[0] for g in found.bodies if j in g) for j in range(len(names))]
+    reference = [next(g[0] for g in connections.bodies if j in g) for j in range(len(names))]
     rows = _best_views(views, reference)
-    poses = [body_pose(view, found) for view in rows.values()]
-    alone = len(found.bodies) == 1
-    labels = [epochs[e] if alone else f"{epochs[e]} {boards.body[names[j]]}" for e, j in rows]
+    poses = [body_pose(view, connections) for view in rows.values()]
+    is_one_body = len(connections.bodies) == 1
+    labels = [epochs[e] if is_one_body else f"{epochs[e]} {boards.body[names[j]]}" for e, j in rows]
     row_of = {key: row for row, key in enumerate(rows)}
     rays = [_rays(camera, epochs, boards, reference, row_of) for camera in cameras]
     epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
     free = {
-        name: one.adjustment.problem.network.cameras[0].free for name, one in calibrations.items()
+        name: calibration.adjustment.problem.network.cameras[0].free
+        for name, calibration in calibrations.items()
     }
     rig = Rig(
         tuple(
-            dataclasses.replace(one.camera, id=name, free=free[name])
-            for name, one in calibrations.items()
+            dataclasses.replace(calibration.camera, id=name, free=free[name])
+            for name, calibration in calibrations.items()
         )
-        + tuple(others.values()),
-        _hold(pose_values(found.mountings), of_rig, known),
+        + tuple(wand_cameras.values()),
+        _hold(pose_values(connections.mountings), of_rig, known),
         tuple(labels),
         pose_values(poses),
         boards.ids,
@@ -219,14 +228,14 @@ def start_rig(
         times=tuple(epochs[e] for e, _ in rows),
         boards=tuple(names),
         board=np.repeat(np.arange(len(names)), [len(b.ids) for b in boards.boards.values()]),
-        centroids=np.array([one.points.mean(0) for one in boards.boards.values()]),
+        centroids=np.array([calibration.points.mean(0) for calibration in boards.boards.values()]),
         place=None
-        if len(found.bodies) == len(found.places)
-        else pose_values(found.places[: len(names)]),
+        if len(connections.bodies) == len(connections.places)
+        else pose_values(connections.places[: len(names)]),
         body=tuple(reference),
         known=known,
     )
-    return rig, found
+    return rig, connections
 
 
 def _keys(calibrations: Mapping[str, Calibration], wand: "WandBody | None") -> Keys:
@@ -244,19 +253,19 @@ def _best_views(
     views: Sequence[BoardView], reference: Sequence[int]
 ) -> dict[tuple[int, int], BoardView]:
     """By epoch and body (its first board) the view with most points."""
-    found: dict[tuple[int, int], BoardView] = {}
+    best: dict[tuple[int, int], BoardView] = {}
     for view in views:
         key = view.epoch, reference[view.board]
-        if key not in found or view.points > found[key].points:
-            found[key] = view
-    return found
+        if key not in best or view.points > best[key].points:
+            best[key] = view
+    return best
 
 
 def keys_of_photographs(calibrations: Mapping[str, Calibration]) -> Keys:
     """Every photograph as an epoch of its own, named by camera and photograph."""
     return {
-        name: {photograph: f"{name} {photograph}" for photograph in one.views.photographs}
-        for name, one in calibrations.items()
+        name: {photograph: f"{name} {photograph}" for photograph in calibration.views.photographs}
+        for name, calibration in calibrations.items()
     }
 
 
@@ -269,34 +278,38 @@ def board_views(
     cameras: Sequence[CameraViews], boards: RigBoards, epochs: Sequence[str]
 ) -> list[BoardView]:
     """The poses of all views, boards relative to their centroids."""
-    names, found = list(boards.boards), []
+    names, views_found = list(boards.boards), []
     number = {key: e for e, key in enumerate(epochs)}
     for k, camera in enumerate(cameras):
-        one = camera.calibration
-        seen = one.views.visible.sum(1)
+        calibration = camera.calibration
+        points_seen = calibration.views.visible.sum(1)
         for i, (board, key) in enumerate(zip(camera.board, camera.epoch)):
-            M, X0 = one.rotation[i], one.position[i]
+            M, X0 = calibration.rotation[i], calibration.position[i]
             pose = transformation(M, M @ (boards.boards[board].points.mean(0) - X0))
-            found.append(BoardView(k, names.index(board), number[key], pose, int(seen[i])))
-    return found
+            views_found.append(
+                BoardView(k, names.index(board), number[key], pose, int(points_seen[i]))
+            )
+    return views_found
 
 
 def pose_values(matrices: Sequence[Float[np.ndarray, "4 4"]]) -> PoseValue:
     """Centre and quaternion of poses: R·x + t = R·(x − X0)."""
-    found = np.array(matrices)
-    R, t = found[:, :3, :3], found[:, :3, 3]
+    stack = np.array(matrices)
+    R, t = stack[:, :3, :3], stack[:, :3, 3]
     return PoseValue(-np.einsum("nji,nj->ni", R, t), np.asarray(_quaternions(R)))
 
 
-def _hold(mounting: PoseValue, cameras: Sequence[str], known: KnownMountings) -> PoseValue:
+def _hold(
+    mounting: PoseValue, cameras: Sequence[str], known_mountings: KnownMountings
+) -> PoseValue:
     """Mountings with those parts that are held as they are given."""
     position, rotation = np.array(mounting.position), np.array(mounting.rotation)
-    for name, one in known.mountings.items():
+    for name, mounting_given in known_mountings.mountings.items():
         k = cameras.index(name)
-        if one.held[0]:
-            position[k] = one.position
-        if one.held[1]:
-            M = matrix_from_omega_phi_kappa(not_none(one.angles))
+        if mounting_given.held[0]:
+            position[k] = mounting_given.position
+        if mounting_given.held[1]:
+            M = matrix_from_omega_phi_kappa(not_none(mounting_given.angles))
             rotation[k] = quaternion_from_matrix(M)
     return PoseValue(position, rotation)
 
@@ -322,13 +335,13 @@ def _rays(
     names = list(boards.boards)
     # Of a video every photograph is an epoch: a search of the list for each takes the square.
     number = {key: e for e, key in enumerate(epochs)}
-    at = {
+    row_of_image = {
         view: row_of[number[key], reference[names.index(board)]]
         for view, board, key in zip(views.names, camera.board, camera.epoch)
     }
     point = dict(zip(views.board.ids, camera.rows))
     return (
-        np.array([at[id] for id in network.images.id])[rays.image[used]],
+        np.array([row_of_image[id] for id in network.images.id])[rays.image[used]],
         np.array([point[id] for id in network.points.id])[rays.point[used]],
         rays.xy[used],
         rays.sigma[used],

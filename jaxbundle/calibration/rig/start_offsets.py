@@ -61,29 +61,32 @@ def speeds_of_cameras(
     tracks: dict[tuple[int, int], list[BoardView]] = defaultdict(list)
     for view in views:
         tracks[view.camera, view.board].append(view)
-    found: list[dict] = [defaultdict(list) for _ in frame]
+    speeds: list[dict] = [defaultdict(list) for _ in frame]
     h = settings.half_window
-    for (camera, board), own in tracks.items():
-        own = sorted(own, key=lambda view: time[view.epoch])
-        t = time[[view.epoch for view in own]]
-        T = np.array([view.pose for view in own])
-        first, last = np.arange(len(own) - 2 * h), np.arange(2 * h, len(own))
-        span = t[last] - t[first]
+    for (camera, board), views_of_track in tracks.items():
+        views_of_track = sorted(views_of_track, key=lambda view: time[view.epoch])
+        t = time[[view.epoch for view in views_of_track]]
+        T = np.array([view.pose for view in views_of_track])
+        earlier, later = (
+            np.arange(len(views_of_track) - 2 * h),
+            np.arange(2 * h, len(views_of_track)),
+        )
+        span = t[later] - t[earlier]
         # Half a frame of tolerance: none is missing between.
         close = (span > 0) & (span < (2 * h + 0.5) * frame[camera])
-        first, last, span = first[close], last[close], span[close]
+        earlier, later, span = earlier[close], later[close], span[close]
         if not len(span):
             continue
-        middle = (t[first] + t[last]) / 2
-        trace = np.einsum("nij,nij->n", T[first, :3, :3], T[last, :3, :3])
+        middle = (t[earlier] + t[later]) / 2
+        trace = np.einsum("nij,nij->n", T[earlier, :3, :3], T[later, :3, :3])
         turned = np.arccos(np.clip((trace - 1) / 2, -1, 1)) / span
-        moved = np.linalg.norm(T[last, :3, 3] - T[first, :3, 3], axis=1) / span
-        found[camera]["turn", body[board]].append((middle, turned))
-        found[camera]["move", board].append((middle, moved))
+        speed = np.linalg.norm(T[later, :3, 3] - T[earlier, :3, 3], axis=1) / span
+        speeds[camera]["turn", body[board]].append((middle, turned))
+        speeds[camera]["move", board].append((middle, speed))
     gap = (2 * h + 0.5) * frame
     return [
         {key: _merge(parts, gap[k]) for key, parts in of_camera.items()}
-        for k, of_camera in enumerate(found)
+        for k, of_camera in enumerate(speeds)
     ]
 
 
@@ -102,14 +105,16 @@ def start_offsets(
     offset, score = np.zeros((number, number)), np.full((number, number), -np.inf)
     for i in range(number):
         for j in range(i + 1, number):
-            found = _offset_of_pair(speeds[i], speeds[j], min(frame[i], frame[j]), settings)
-            offset[i, j], score[i, j] = found
-            offset[j, i], score[j, i] = -found[0], found[1]
+            offset_and_score = _offset_of_pair(
+                speeds[i], speeds[j], min(frame[i], frame[j]), settings
+            )
+            offset[i, j], score[i, j] = offset_and_score
+            offset[j, i], score[j, i] = -offset_and_score[0], offset_and_score[1]
     of_first = np.full(number, np.nan)
     of_first[0] = 0.0
     while True:
-        done = np.isfinite(of_first)
-        open_pairs = np.where(done[:, None] & ~done[None], score, -np.inf)
+        is_done = np.isfinite(of_first)
+        open_pairs = np.where(is_done[:, None] & ~is_done[None], score, -np.inf)
         i, j = np.unravel_index(np.argmax(open_pairs), score.shape)
         if not np.isfinite(open_pairs[i, j]):
             return of_first
@@ -117,56 +122,68 @@ def start_offsets(
 
 
 def _offset_of_pair(
-    one: SpeedsOfCamera, other: SpeedsOfCamera, frame: float, settings: OffsetSettings
+    speeds_a: SpeedsOfCamera, speeds_b: SpeedsOfCamera, frame: float, settings: OffsetSettings
 ) -> tuple[float, float]:
     """The offset of the other clock relative to the one, and its likelihood ratio; −∞ if it is not
     significant."""
     from scipy.stats import chi2
 
-    common = [key for key in one if key in other]
+    common = [key for key in speeds_a if key in speeds_b]
     if not common:
         return 0.0, -np.inf
-    ends = [(a.time[0] - b.time[-1], a.time[-1] - b.time[0]) for a, b in _pairs(one, other, common)]
+    ends = [
+        (a.time[0] - b.time[-1], a.time[-1] - b.time[0])
+        for a, b in _pairs(speeds_a, speeds_b, common)
+    ]
     step = frame / settings.steps
-    first, last = int(np.floor(min(e[0] for e in ends) / step)), max(e[1] for e in ends)
-    tried = step * np.arange(first, int(np.ceil(last / step)) + 1)
-    score = np.sum([_scores(*pair, tried, settings) for pair in _pairs(one, other, common)], axis=0)
+    first_step, last_offset = int(np.floor(min(e[0] for e in ends) / step)), max(e[1] for e in ends)
+    offsets = step * np.arange(first_step, int(np.ceil(last_offset / step)) + 1)
+    score = np.sum(
+        [_scores(*pair, offsets, settings) for pair in _pairs(speeds_a, speeds_b, common)], axis=0
+    )
     k = int(np.argmax(score))
-    limit = chi2.isf(settings.significance / len(tried), len(common))
+    limit = chi2.isf(settings.significance / len(offsets), len(common))
     if score[k] < limit:
         return 0.0, -np.inf
-    before, at, after = score[max(k - 1, 0)], score[k], score[min(k + 1, len(tried) - 1)]
-    bend = before - 2 * at + after
+    score_before, score_at, score_after = (
+        score[max(k - 1, 0)],
+        score[k],
+        score[min(k + 1, len(offsets) - 1)],
+    )
+    bend = score_before - 2 * score_at + score_after
     # The vertex of the parabola through three values.
-    shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return float(tried[k] + step * np.clip(shift, -0.5, 0.5)), float(at)
+    shift = 0.5 * (score_before - score_after) / bend if bend < 0 else 0.0
+    return float(offsets[k] + step * np.clip(shift, -0.5, 0.5)), float(score_at)
 
 
 def _pairs(
-    one: SpeedsOfCamera, other: SpeedsOfCamera, common: Sequence[tuple[str, int]]
+    speeds_a: SpeedsOfCamera, speeds_b: SpeedsOfCamera, common: Sequence[tuple[str, int]]
 ) -> list[tuple[Speeds, Speeds]]:
-    return [(one[key], other[key]) for key in common]
+    return [(speeds_a[key], speeds_b[key]) for key in common]
 
 
 def _scores(
-    a: Speeds, b: Speeds, tried: Float[np.ndarray, " offsets"], settings: OffsetSettings
+    a: Speeds, b: Speeds, offsets: Float[np.ndarray, " offsets"], settings: OffsetSettings
 ) -> Float[np.ndarray, " offsets"]:
     """The likelihood ratio of a positive correlation at every offset of b."""
-    found, least = np.zeros(len(tried)), settings.min_overlap * min(len(a.time), len(b.time))
+    scores, min_number = (
+        np.zeros(len(offsets)),
+        settings.min_overlap * min(len(a.time), len(b.time)),
+    )
     # Speeds over several frames are not independent.
     independent = 1 / (2 * settings.half_window)
-    for k, offset in enumerate(tried):
+    for k, offset in enumerate(offsets):
         t = a.time - offset
-        after: Int[np.ndarray, " n"] = np.searchsorted(b.time, t).clip(1, len(b.time) - 1)
-        inside = (t >= b.time[after - 1]) & (t <= b.time[after])
-        inside &= b.time[after] - b.time[after - 1] < b.gap
-        n = int(inside.sum())
-        if n < max(least, 1 / independent):
+        next_row: Int[np.ndarray, " n"] = np.searchsorted(b.time, t).clip(1, len(b.time) - 1)
+        is_inside = (t >= b.time[next_row - 1]) & (t <= b.time[next_row])
+        is_inside &= b.time[next_row] - b.time[next_row - 1] < b.gap
+        n = int(is_inside.sum())
+        if n < max(min_number, 1 / independent):
             continue
-        x, y = a.value[inside], np.interp(t[inside], b.time, b.value)
+        x, y = a.value[is_inside], np.interp(t[is_inside], b.time, b.value)
         x, y = x - x.mean(), y - y.mean()
         size = np.sqrt((x @ x) * (y @ y))
         r = x @ y / size if size > 0 else 0.0
         # 1e-12: of equal sequences without errors the ratio would be infinite
-        found[k] = -independent * n * np.log(max(1 - r * r, 1e-12)) if r > 0 else 0.0
-    return found
+        scores[k] = -independent * n * np.log(max(1 - r * r, 1e-12)) if r > 0 else 0.0
+    return scores

@@ -92,7 +92,7 @@ def start_unsynchronized(
     calibrations: Mapping[str, Calibration],
     bodies: Mapping[str, Sequence[str]] | None,
     fixed: bool,
-    known: KnownMountings,
+    known_mountings: KnownMountings,
     times: Times,
     estimated: Sequence[str],
     settings: SynchronizationSettings = SYNCHRONIZATION,
@@ -112,18 +112,22 @@ def start_unsynchronized(
     offset = np.nan_to_num(start_offsets(speeds, frame, settings.offsets))
     clocks = _start_clocks(calibrations, times, offset, frame, estimated, settings)
     rig, connections = start_rig(
-        calibrations, bodies, fixed, known, _nearly_simultaneous(calibrations, times, clocks, frame)
+        calibrations,
+        bodies,
+        fixed,
+        known_mountings,
+        _nearly_simultaneous(calibrations, times, clocks, frame),
     )
     number = {name: k for k, name in enumerate(epochs)}
     row_time = time[[number[name] for name in rig.epoch_of_rows]]
     camera_of = {name: k for k, camera in enumerate(cameras) for name in camera.epoch}
     camera = np.array([camera_of[name] for name in rig.epoch_of_rows])
-    centres = {name: one.points for name, one in boards.boards.items()}
+    centres = {name: board.points for name, board in boards.boards.items()}
     spacing = max(
         _knots(views, [*centres.values()], time, float(np.median(frame))) / settings.undersmoothing,
         settings.least_frames * float(np.median(frame)),
     )
-    sigma0 = float(np.median([one.adjustment.sigma0 for one in calibrations.values()]))
+    sigma0 = float(np.median([board.adjustment.sigma0 for board in calibrations.values()]))
     empty = TargetMotion(
         clocks,
         camera,
@@ -180,15 +184,17 @@ def _time_of_epochs(
 ) -> tuple[Float[np.ndarray, " epochs"], Float[np.ndarray, " cameras"]]:
     """The time of every photograph by its own clock, and the median from one to the next, by
     camera."""
-    found, frame = [], []
-    for name, one in calibrations.items():
-        own = [times[name][photograph] for photograph in dict.fromkeys(one.views.photographs)]
-        step = np.diff(np.unique(own))
+    all_times, frame = [], []
+    for name, calibration in calibrations.items():
+        times_of_camera = [
+            times[name][photograph] for photograph in dict.fromkeys(calibration.views.photographs)
+        ]
+        step = np.diff(np.unique(times_of_camera))
         if not len(step):
             raise InputError(f"camera {name}: all photographs have the same time")
         frame.append(float(np.median(step)))
-        found += own
-    return np.array(found), np.array(frame)
+        all_times += times_of_camera
+    return np.array(all_times), np.array(frame)
 
 
 def _start_clocks(
@@ -199,17 +205,17 @@ def _start_clocks(
     estimated: Sequence[str],
     settings: SynchronizationSettings,
 ) -> Clocks:
-    own = [np.array([*times[name].values()]) for name in calibrations]
+    times_of_cameras = [np.array([*times[name].values()]) for name in calibrations]
     # About the first photograph, offset and rate would correlate by √3/2.
-    middle = np.array([(t.min() + t.max()) / 2 for t in own])
-    free = np.array([[name in estimated for name in CLOCK_PARAMETERS]] * len(own))
+    middle = np.array([(t.min() + t.max()) / 2 for t in times_of_cameras])
+    free = np.array([[name in estimated for name in CLOCK_PARAMETERS]] * len(times_of_cameras))
     # The clock of the reference is the common one, but it may have a rolling shutter, too.
     free[0, [CLOCK_PARAMETERS.index(OFFSET), CLOCK_PARAMETERS.index(RATE)]] = False
     # An offset is within the recording, a frame is read out before the next one.
-    duration = max(float(np.ptp(t)) for t in own)
-    ones = np.ones(len(own))
+    duration = max(float(np.ptp(t)) for t in times_of_cameras)
+    ones = np.ones(len(times_of_cameras))
     prior = np.stack([duration * ones, settings.rate_sigma * ones, frame], 1)
-    value = np.zeros((len(own), 3))
+    value = np.zeros((len(times_of_cameras), 3))
     value[:, 0] = offset
     return Clocks(value, free, prior, middle)
 
@@ -221,15 +227,15 @@ def _nearly_simultaneous(
     frame: Float[np.ndarray, " cameras"],
 ) -> dict[str, dict[str, str]]:
     """Photographs of all cameras by the frame of the reference that is nearest."""
-    first = min(times[next(iter(calibrations))].values())
-    found = {}
-    for k, (name, one) in enumerate(calibrations.items()):
-        photographs = list(dict.fromkeys(one.views.photographs))
+    first_time = min(times[next(iter(calibrations))].values())
+    keys = {}
+    for k, (name, calibration) in enumerate(calibrations.items()):
+        photographs = list(dict.fromkeys(calibration.views.photographs))
         t = np.array([times[name][p] for p in photographs])
         common = clocks.common(np.full(len(t), k), t)
-        frames = np.round((common - first) / frame[0]).astype(int)
-        found[name] = dict(zip(photographs, map(str, frames)))
-    return found
+        frames = np.round((common - first_time) / frame[0]).astype(int)
+        keys[name] = dict(zip(photographs, map(str, frames)))
+    return keys
 
 
 def _knots(
@@ -247,19 +253,22 @@ def _knots(
     for view in views:
         tracks.setdefault((view.camera, view.board), []).append(view)
     parts = []
-    for (_, board), own in tracks.items():
-        own = sorted(own, key=lambda view: time[view.epoch])
-        t, T = time[[view.epoch for view in own]], np.array([view.pose for view in own])
+    for (_, board), views_of_track in tracks.items():
+        views_of_track = sorted(views_of_track, key=lambda view: time[view.epoch])
+        t, T = (
+            time[[view.epoch for view in views_of_track]],
+            np.array([view.pose for view in views_of_track]),
+        )
         X = boards[board] - boards[board].mean(0)
         corners = X[[0, int(np.argmax(X @ [1, -1, 0])), len(X) - 1]]
         places = np.einsum("nij,pj->npi", T[:, :3, :3], corners) + T[:, None, :3, 3]
         ends = np.flatnonzero(np.diff(t) > 1.5 * frame) + 1
-        whole = zip(np.split(t, ends), np.split(places.reshape(len(t), 9), ends))
-        parts += [(a, b) for a, b in whole if len(a) >= 4 * CONTROLS]
+        parts_of_track = zip(np.split(t, ends), np.split(places.reshape(len(t), 9), ends))
+        parts += [(a, b) for a, b in parts_of_track if len(a) >= 4 * CONTROLS]
     # Half steps of the logarithm, from two frames to a second.
-    tried = frame * 2 ** np.arange(1, np.log2(max(1 / frame, 4)) + 0.5, 0.5)
-    score = [sum(_aic(t, x, spacing) for t, x in parts) for spacing in tried]
-    return float(tried[int(np.argmin(score))]) if parts else float(tried[0])
+    spacings = frame * 2 ** np.arange(1, np.log2(max(1 / frame, 4)) + 0.5, 0.5)
+    score = [sum(_aic(t, x, spacing) for t, x in parts) for spacing in spacings]
+    return float(spacings[int(np.argmin(score))]) if parts else float(spacings[0])
 
 
 def _aic(t: Float[np.ndarray, " n"], x: Float[np.ndarray, "n 9"], spacing: float) -> float:
@@ -275,9 +284,9 @@ def _aic(t: Float[np.ndarray, " n"], x: Float[np.ndarray, "n 9"], spacing: float
     n, p = A.shape
     if n < p + 3:
         return np.inf
-    left = x - A @ np.linalg.lstsq(A, x, rcond=None)[0]
+    residuals = x - A @ np.linalg.lstsq(A, x, rcond=None)[0]
     # Coordinates without any error have no logarithm.
-    variance = np.maximum((left**2).mean(0), 1e-300)
+    variance = np.maximum((residuals**2).mean(0), 1e-300)
     return float((n * np.log(variance) + 2 * p * n / (n - p - 1)).sum())
 
 
@@ -289,24 +298,29 @@ def adjust_unsynchronized(
     First with the clocks held: iterations would walk along a valley if the motion left them open.
     The rig is that with knots by its final clocks."""
     start = not_none(rig.trajectory).clocks
-    none = dataclasses.replace(start, free=np.zeros_like(start.free))
-    rig, found = _adjust_until_assigned(_with_clocks(rig, none), settings, max_iterations)
-    if not found.converged:
-        return rig, found, {}
-    rig = _with_clocks(_started_at(rig, found), start)
+    held_clocks = dataclasses.replace(start, free=np.zeros_like(start.free))
+    rig, result = _adjust_until_assigned(_with_clocks(rig, held_clocks), settings, max_iterations)
+    if not result.converged:
+        return rig, result, {}
+    rig = _with_clocks(_started_at(rig, result), start)
     # One iteration for its normal equations alone: its values are not used.
     probe = adjust_rig(rig, 1)
-    at = Solution(probe.problem, probe.problem.data.start)
-    held = _undetermined(rig, at, not_none(rig.trajectory).sigma0 ** 2, settings)
+    start_solution = Solution(probe.problem, probe.problem.data.start)
+    held_unknowns = _undetermined(
+        rig, start_solution, not_none(rig.trajectory).sigma0 ** 2, settings
+    )
     while True:
-        rig = _hold(rig, held, start)
-        rig, found = _adjust_until_assigned(rig, settings, max_iterations)
-        if not found.converged:
-            return rig, found, held
-        more = _undetermined(rig, found.solution, found.sigma0**2, settings)
-        if not more:
-            return rig, found, held
-        held = {name: held.get(name, {}) | more.get(name, {}) for name in held | more}
+        rig = _hold(rig, held_unknowns, start)
+        rig, result = _adjust_until_assigned(rig, settings, max_iterations)
+        if not result.converged:
+            return rig, result, held_unknowns
+        newly_held = _undetermined(rig, result.solution, result.sigma0**2, settings)
+        if not newly_held:
+            return rig, result, held_unknowns
+        held_unknowns = {
+            name: held_unknowns.get(name, {}) | newly_held.get(name, {})
+            for name in held_unknowns | newly_held
+        }
 
 
 def _with_clocks(rig: Rig, clocks: Clocks) -> Rig:
@@ -315,9 +329,9 @@ def _with_clocks(rig: Rig, clocks: Clocks) -> Rig:
     )
 
 
-def _started_at(rig: Rig, found: Result) -> Rig:
+def _started_at(rig: Rig, result: Result) -> Rig:
     """The rig with the poses and mountings of a solution as start values."""
-    values = found.minimum.values
+    values = result.minimum.values
     trajectory = dataclasses.replace(
         not_none(rig.trajectory), poses=jax.tree.map(np.asarray, values[TRAJECTORY])
     )
@@ -329,12 +343,12 @@ def _started_at(rig: Rig, found: Result) -> Rig:
     )
 
 
-def _hold(rig: Rig, held: Mapping[str, Mapping[str, str]], start: Clocks) -> Rig:
+def _hold(rig: Rig, held_unknowns: Mapping[str, Mapping[str, str]], start: Clocks) -> Rig:
     """The rig with these unknowns of clocks held at their start values."""
     clocks = not_none(rig.trajectory).clocks
     free, value = clocks.free.copy(), clocks.value.copy()
     for k, camera in enumerate(rig.cameras):
-        for unknown in held.get(camera.id, {}):
+        for unknown in held_unknowns.get(camera.id, {}):
             j = CLOCK_PARAMETERS.index(unknown)
             free[k, j], value[k, j] = False, start.value[k, j]
     clocks = dataclasses.replace(clocks, free=free, value=value)
@@ -345,20 +359,20 @@ def _adjust_until_assigned(
     rig: Rig, settings: SynchronizationSettings, max_iterations: int
 ) -> tuple[Rig, Result]:
     """Adjusted until every instant is in its interval of knots."""
-    for left in reversed(range(settings.max_rounds)):
-        found = adjust_rig(rig, max_iterations)
+    for rounds_left in reversed(range(settings.max_rounds)):
+        result = adjust_rig(rig, max_iterations)
         trajectory = not_none(rig.trajectory)
-        values = found.minimum.values
+        values = result.minimum.values
         new = trajectory.with_clocks(np.asarray(values[CLOCK]))
-        common = [one.clocks.common(one.camera, one.time) for one in (new, trajectory)]
+        common = [motion.clocks.common(motion.camera, motion.time) for motion in (new, trajectory)]
         spacing = min(run.spacing for run in trajectory.runs)
         if np.abs(common[0] - common[1]).max() < settings.max_move * spacing:
             break
         # Control poses belong to the knots they were found with: the last rig keeps these.
-        if left == 0 or not np.isfinite(common[0]).all():
+        if rounds_left == 0 or not np.isfinite(common[0]).all():
             break
         rig = _planned_again(dataclasses.replace(rig, pose=rig.poses(values)), new)
-    return rig, found
+    return rig, result
 
 
 def _planned_again(rig: Rig, trajectory: TargetMotion) -> Rig:
@@ -368,58 +382,58 @@ def _planned_again(rig: Rig, trajectory: TargetMotion) -> Rig:
 
 
 def _undetermined(
-    rig: Rig, at: Solution, variance: float, settings: SynchronizationSettings
+    rig: Rig, solution: Solution, variance: float, settings: SynchronizationSettings
 ) -> dict[str, dict[str, str]]:
     """By camera and unknown of its clock, why the motion does not determine it; `variance` of unit
     weight."""
-    trajectory, held = not_none(rig.trajectory), {}
+    trajectory, held_unknowns = not_none(rig.trajectory), {}
     clocks = trajectory.clocks
     for k, camera in enumerate(rig.cameras):
-        own = trajectory.camera == k
-        if not own.any():
+        is_of_camera = trajectory.camera == k
+        if not is_of_camera.any():
             continue
-        half = float(np.ptp(trajectory.time[own])) / 2
-        frame = float(np.median(np.diff(np.unique(trajectory.time[own]))))
+        half_span = float(np.ptp(trajectory.time[is_of_camera])) / 2
+        frame = float(np.median(np.diff(np.unique(trajectory.time[is_of_camera]))))
         # The effect of each unknown on the time of a photograph, at most.
-        effect = np.array([1.0, half, 0.5])
-        C = variance * _clock_and_mounting(at, k)
+        effect = np.array([1.0, half_span, 0.5])
+        C = variance * _clock_and_mounting(solution, k)
         sigma = np.sqrt(np.clip(np.diagonal(C)[:3], 0, None)) * effect
         for j, name in enumerate(CLOCK_PARAMETERS):
             if not clocks.free[k, j] or 3 * sigma[j] < settings.min_frames_known * frame:
                 continue
             # σ with the mounting held, C_jj − cᵀ·M⁻¹·c: if that is small, the two are exchangeable
             M, c = C[3:, 3:], C[3:, j]
-            known = np.sqrt(max(C[j, j] - c @ np.linalg.pinv(M) @ c, 0.0)) * effect[j]
+            effect_of_sigma = np.sqrt(max(C[j, j] - c @ np.linalg.pinv(M) @ c, 0.0)) * effect[j]
             why = (
                 "the target moves evenly while it is seen: another mounting does the same"
-                if k and 3 * known < settings.min_frames_known * frame
+                if k and 3 * effect_of_sigma < settings.min_frames_known * frame
                 else "the target hardly moves while this camera and others see it"
             )
-            held.setdefault(camera.id, {})[name] = (
+            held_unknowns.setdefault(camera.id, {})[name] = (
                 f"not determined (σ of times {sigma[j]:.2g} s, a frame is {frame:.2g} s): {why}"
             )
-    return held
+    return held_unknowns
 
 
-def _clock_and_mounting(at: Solution, k: int) -> Float[np.ndarray, "9 9"]:
+def _clock_and_mounting(solution: Solution, k: int) -> Float[np.ndarray, "9 9"]:
     """The joint cofactors of the clock and the mounting of a camera."""
-    rows = {t.name: np.zeros((9, t.rows, t.space.width)) for t in at.problem.tables}
+    rows = {t.name: np.zeros((9, t.rows, t.space.width)) for t in solution.problem.tables}
     rows[CLOCK][:3, k], rows[MOUNTING][3:, k] = np.eye(3), np.eye(6)
-    return np.asarray(at.propagate_rows(rows))
+    return np.asarray(solution.propagate_rows(rows))
 
 
 def clocks_of(
     rig: Rig,
     value: Float[np.ndarray, "cameras 3"],
     covariance: Float[np.ndarray, "cameras 3 3"],
-    held: Mapping[str, Mapping[str, str]],
+    held_unknowns: Mapping[str, Mapping[str, str]],
 ) -> dict[str, Clock]:
     """The clocks of all cameras, by their names."""
-    trajectory, found = not_none(rig.trajectory), {}
+    trajectory, clocks_found = not_none(rig.trajectory), {}
     for k, camera in enumerate(rig.cameras):
         step = np.diff(np.unique(trajectory.time[trajectory.camera == k]))
         offset, rate, read_out = value[k].tolist()
-        found[camera.id] = Clock(
+        clocks_found[camera.id] = Clock(
             offset,
             rate,
             read_out,
@@ -427,6 +441,6 @@ def clocks_of(
             float(trajectory.clocks.middle[k]),
             float(np.median(step)),
             tuple(np.array(CLOCK_PARAMETERS)[trajectory.clocks.free[k]].tolist()),
-            dict(held.get(camera.id, {})),
+            dict(held_unknowns.get(camera.id, {})),
         )
-    return found
+    return clocks_found

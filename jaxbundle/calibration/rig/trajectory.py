@@ -99,14 +99,14 @@ class TargetMotion:
         without a run those of the first run, for observations without weight."""
         number, camera, time = np.maximum(self.run[row], 0), self.camera[row], self.time[row]
         fields = [(r.first, r.start, r.spacing, r.intervals) for r in self.runs]
-        first, start, spacing, size = np.array(fields).T[:, number]
+        first_pose, start, spacing, size = np.array(fields).T[:, number]
         common = self.clocks.common(camera, time, line)
         # Before the first knot and behind the last one the cubic of the outer interval goes on.
         k = np.clip(np.floor((common - start) / spacing), 0, size - 1)
         # By its own clock: offset, rate and read-out are added where they are unknowns.
         since = time - (start + k * spacing)
         instant = Instant(since, time - self.clocks.middle[camera], line, 1 / spacing)
-        return (first + k).astype(int), instant
+        return (first_pose + k).astype(int), instant
 
     def with_clocks(self, value: Float[np.ndarray, "cameras 3"]) -> "TargetMotion":
         """The same with other start values of the clocks."""
@@ -114,12 +114,16 @@ class TargetMotion:
 
     def view_poses(self, controls: PoseValue, clocks: Float[np.ndarray, "cameras 3"]) -> PoseValue:
         """The pose of the reference camera relative to the body of every row, at its time."""
-        moved = self.with_clocks(np.asarray(clocks))
-        first, instant = moved.intervals(np.arange(len(self.time)), np.zeros(len(self.time)))
-        common = moved.clocks.common(self.camera, self.time)
+        with_clocks = self.with_clocks(np.asarray(clocks))
+        first_pose, instant = with_clocks.intervals(
+            np.arange(len(self.time)), np.zeros(len(self.time))
+        )
+        common = with_clocks.clocks.common(self.camera, self.time)
         u = (instant.since + common - self.time) * instant.frequency
-        at = first[:, None] + np.arange(CONTROLS)
-        return jax.tree.map(np.asarray, _view_poses(jax.tree.map(lambda x: x[at], controls), u))
+        pose_rows = first_pose[:, None] + np.arange(CONTROLS)
+        return jax.tree.map(
+            np.asarray, _view_poses(jax.tree.map(lambda x: x[pose_rows], controls), u)
+        )
 
 
 @partial(compile_once, static=())
@@ -147,9 +151,9 @@ def plan_runs(
     A run ends where no photograph is within `gap`. It has at most half as many control poses as
     photographs at different times, so that these determine them with as much redundancy."""
     runs: list[Run] = []
-    of, first = np.full(len(common), -1), 0
-    for one in np.unique(body):
-        rows = np.flatnonzero(body == one)
+    run_of_row, first_pose = np.full(len(common), -1), 0
+    for one_body in np.unique(body):
+        rows = np.flatnonzero(body == one_body)
         rows = rows[np.argsort(common[rows], kind="stable")]
         ends = np.flatnonzero(np.diff(common[rows]) > gap) + 1
         for part in np.split(rows, ends):
@@ -159,13 +163,13 @@ def plan_runs(
             if different < 2 * CONTROLS:
                 continue
             # n intervals have n + 3 control poses
-            most = different // 2 - CONTROLS + 1
-            intervals = int(np.clip(np.ceil((t[-1] - t[0]) / spacing), 1, most))
-            run = Run(first, t[0], (t[-1] - t[0]) / intervals, intervals)
-            of[part] = len(runs)
+            max_intervals = different // 2 - CONTROLS + 1
+            intervals = int(np.clip(np.ceil((t[-1] - t[0]) / spacing), 1, max_intervals))
+            run = Run(first_pose, t[0], (t[-1] - t[0]) / intervals, intervals)
+            run_of_row[part] = len(runs)
             runs.append(run)
-            first += run.controls
-    return tuple(runs), of
+            first_pose += run.controls
+    return tuple(runs), run_of_row
 
 
 def control_poses(
@@ -180,18 +184,22 @@ def control_poses(
     M, X0 = np.asarray(_matrices(pose.rotation)), np.asarray(pose.position)
     t, inverse = -np.einsum("nij,nj->ni", M, X0), np.asarray(_quaternions(M.swapaxes(1, 2)))
     position, rotation = [], []
-    for number, one in enumerate(runs):
+    for number, motion_run in enumerate(runs):
         rows = np.flatnonzero(run == number)
         rows = rows[np.argsort(common[rows], kind="stable")]
         # Control j is that of most weight at knot j − 1: 2/3 there, 1/6 for each neighbour.
-        at = one.start + one.spacing * (np.arange(one.controls) - 1)
-        at = np.clip(at, common[rows[0]], common[rows[-1]])
-        k = np.clip(np.searchsorted(common[rows], at, side="right") - 1, 0, len(rows) - 2)
-        before, after = rows[k], rows[k + 1]
-        span = np.maximum(common[after] - common[before], np.finfo(float).tiny)
-        part = ((at - common[before]) / span)[:, None]
-        position.append(t[before] + part * (t[after] - t[before]))
-        rotation.append(np.asarray(_between(inverse[before], inverse[after], part)))
+        control_times = motion_run.start + motion_run.spacing * (np.arange(motion_run.controls) - 1)
+        control_times = np.clip(control_times, common[rows[0]], common[rows[-1]])
+        k = np.clip(
+            np.searchsorted(common[rows], control_times, side="right") - 1, 0, len(rows) - 2
+        )
+        previous, following = rows[k], rows[k + 1]
+        span = np.maximum(common[following] - common[previous], np.finfo(float).tiny)
+        part = ((control_times - common[previous]) / span)[:, None]
+        position.append(t[previous] + part * (t[following] - t[previous]))
+        rotation.append(
+            np.asarray(_interpolate_rotations(inverse[previous], inverse[following], part))
+        )
     return PoseValue(np.concatenate(position), np.concatenate(rotation))
 
 
@@ -206,9 +214,11 @@ def _quaternions(M: Float[AnyArray, "n 3 3"]) -> Float[Array, "n 4"]:
 
 
 @partial(compile_once, static=())
-def _between(
-    one: Float[AnyArray, "n 4"], other: Float[AnyArray, "n 4"], part: Float[AnyArray, "n 1"]
+def _interpolate_rotations(
+    rotation_a: Float[AnyArray, "n 4"],
+    rotation_b: Float[AnyArray, "n 4"],
+    part: Float[AnyArray, "n 1"],
 ) -> Float[Array, "n 4"]:
     return jax.vmap(lambda a, b, s: retract_quaternion(a, s * quaternion_difference(b, a)))(
-        one, other, part
+        rotation_a, rotation_b, part
     )

@@ -75,20 +75,26 @@ class WandCalibration(TableMethods):
     def mountings(self) -> dict[str, Mounting]:
         """The mounting of every camera but the first in the frame of that, with its covariance."""
         row = {name: k for k, name in enumerate(self.adjustment.problem.network.images.id)}
-        first, *others = (row[name] for name in self.names)
-        C = np.asarray(self.adjustment.covariance_of(_Mountings(first, tuple(others))))
-        found = {}
+        first_row, *other_rows = (row[name] for name in self.names)
+        C = np.asarray(self.adjustment.covariance_of(_Mountings(first_row, tuple(other_rows))))
+        mountings_found = {}
         for k, name in enumerate(self.names[1:]):
-            at = _relative(self.adjustment.values["image"], first, others[k])
-            own, base = C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].copy(), np.asarray(at.position)
-            own[:3, :3] += self.scale_sigma**2 * np.outer(base, base)
-            found[name] = mounting_of(PoseValue(*map(np.asarray, at)), own)
-        return found
+            pose = _relative(self.adjustment.values["image"], first_row, other_rows[k])
+            covariance, base = (
+                C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].copy(),
+                np.asarray(pose.position),
+            )
+            covariance[:3, :3] += self.scale_sigma**2 * np.outer(base, base)
+            mountings_found[name] = mounting_of(PoseValue(*map(np.asarray, pose)), covariance)
+        return mountings_found
 
     def network(self) -> Network:
         """The cameras on their mountings as a network of one image each, as of a
         `RigCalibration`: to write for other programs (`jaxbundle.io`)."""
-        cameras = {one.id: one for one in self.adjustment.problem.network.cameras}
+        cameras = {
+            camera_of_network.id: camera_of_network
+            for camera_of_network in self.adjustment.problem.network.cameras
+        }
         adjusted = [
             dataclasses.replace(cameras[name], parameters=self.adjustment.camera_parameters(name))
             for name in self.names
@@ -97,8 +103,8 @@ class WandCalibration(TableMethods):
         return network_of_rig(
             Path("rig"),
             adjusted,
-            [np.eye(3), *(one.rotation for one in mountings)],
-            [np.zeros(3), *(one.base for one in mountings)],
+            [np.eye(3), *(camera_of_network.rotation for camera_of_network in mountings)],
+            [np.zeros(3), *(camera_of_network.base for camera_of_network in mountings)],
         )
 
     def table(self) -> dict[str, np.ndarray]:
@@ -138,7 +144,7 @@ class WandCalibration(TableMethods):
             base = ", ".join(f"{x:.6g} ± {s:.2g}" for x, s in zip(m.base, m.sigma))
             turn = ", ".join(f"{x:.5g} ± {s:.2g}" for x, s in zip(m.angles, m.sigma[3:]))
             lines.append(f"{name}: base {base} {unit}; ω, φ, κ {turn} deg")
-        return "\n".join([*lines, *(f"note: {said}" for said in self.notes)])
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,18 +161,18 @@ class _Mountings:
     def __call__(self, values: Mapping[str, Any]) -> Array:
         changes = []
         for k in self.others:
-            at = _relative(values["image"], self.first, k)
-            R = matrix_from_quaternion(at.rotation)
+            pose = _relative(values["image"], self.first, k)
+            R = matrix_from_quaternion(pose.rotation)
             turn = rotation_vector_from_matrix(R @ jax.lax.stop_gradient(R).T)
-            changes += [jnp.asarray(at.position), turn]
+            changes += [jnp.asarray(pose.position), turn]
         return jnp.concatenate(changes)
 
 
-def _relative(images: PoseValue, first: int, k: int) -> PoseValue:
+def _relative(images: PoseValue, first_row: int, k: int) -> PoseValue:
     """The pose of an image in the frame of another one."""
-    M = matrix_from_quaternion(images.rotation[first])
+    M = matrix_from_quaternion(images.rotation[first_row])
     R = matrix_from_quaternion(images.rotation[k]) @ M.T
-    base = M @ (images.position[k] - images.position[first])
+    base = M @ (images.position[k] - images.position[first_row])
     return PoseValue(base, quaternion_from_matrix(R))
 
 
@@ -217,20 +223,28 @@ def calibrate_wand(
                 f"cameras: none {name!r}{did_you_mean(name, cameras)}; expected the interior "
                 "orientation of every camera"
             )
-    images = {name: given for name, given in markers.items() if are_images(given)}
-    tables = {name: _marks(name, given) for name, given in markers.items() if name not in images}
-    frames = {name: [*dict.fromkeys(m.frame for m in own)] for name, own in tables.items()}
+    images = {name: source for name, source in markers.items() if are_images(source)}
+    tables = {name: _marks(name, source) for name, source in markers.items() if name not in images}
+    frames = {
+        name: [*dict.fromkeys(m.frame for m in marks_of_camera)]
+        for name, marks_of_camera in tables.items()
+    }
     pairs, notes, measured = _pairs(lengths, tables), [], {}
     if images:
-        found = measure_wand(images, cameras, frames, blobs or BlobSettings(), progress)
-        measured, notes = found
+        measured_and_notes = measure_wand(
+            images, cameras, frames, blobs or BlobSettings(), progress
+        )
+        measured, notes = measured_and_notes
     if sigma_image is not None:
-        measured = {name: replaced_sigma(own, sigma_image) for name, own in measured.items()}
+        measured = {
+            name: replaced_sigma(marks_of_camera, sigma_image)
+            for name, marks_of_camera in measured.items()
+        }
     marks = {name: (measured if name in images else tables)[name] for name in markers}
-    marks, said = name_markers(marks, cameras, pairs, settings or WandSettings())
-    notes += said
+    marks, remarks = name_markers(marks, cameras, pairs, settings or WandSettings())
+    notes += remarks
     declare = lambda marks: _network(marks, cameras, pairs, sigma_length, sigma_image, object_unit)
-    network, said = declare(marks)
+    network, remarks = declare(marks)
     result = adjust(network, **options)
     if images and sigma_image is None and result.converged:
         # σ by the noise of the grey values: compression smooths it, and shifts centres by more.
@@ -239,13 +253,13 @@ def calibrate_wand(
         for name in images:
             marks[name] = [m._replace(sx=factor * m.sx, sy=factor * m.sy) for m in marks[name]]
         result = adjust(declare(marks)[0], **options)
-        said += [f"σ of markers in images: {factor:.2f} times what the noise says, by residuals"]
+        remarks += [f"σ of markers in images: {factor:.2f} times what the noise says, by residuals"]
     longest = max(pairs.values())
     # Nobody waves a wand of ten metres; in millimetres it would be one of a centimetre at least.
     if object_unit == "m" and longest > 10:
-        said += [f"the wand is {longest:g} m long: is this in mm? Lengths and σ are of one unit"]
+        remarks += [f"the wand is {longest:g} m long: is this in mm? Lengths and σ are of one unit"]
     scale = sigma_length / float(np.sqrt(np.sum(np.square([*pairs.values()]))))
-    return WandCalibration(result, tuple(markers), scale, (*notes, *said), marks, pairs)
+    return WandCalibration(result, tuple(markers), scale, (*notes, *remarks), marks, pairs)
 
 
 def _residuals_over_sigma(result: Adjustment, cameras: Collection[str]) -> float:
@@ -254,54 +268,59 @@ def _residuals_over_sigma(result: Adjustment, cameras: Collection[str]) -> float
     table = result.residuals
     rows = (table["kind"] == "image") & np.isin(table["image"].astype(str), [*cameras])
     ratio, r = (table["v"] / table["sigma"])[rows], table["r"][rows]
-    taken = np.isfinite(ratio) & (r > 0)
-    size = float(np.sqrt((ratio[taken] ** 2).sum() / max(r[taken].sum(), 1.0)))
+    is_tested = np.isfinite(ratio) & (r > 0)
+    size = float(np.sqrt((ratio[is_tested] ** 2).sum() / max(r[is_tested].sum(), 1.0)))
     # Exact images leave nothing.
     return size if size > 0 else 1.0
 
 
-def _marks(camera: str, given: Any) -> Marks:
+def _marks(camera: str, source: Any) -> Marks:
     """The markers of a camera that are given in a table.
 
     **Raises:** `InputError` naming file or camera, frame and column."""
-    of = str(given) if isinstance(given, str | Path) else f"markers of camera {camera!r}"
-    table = read_csv(Path(given)).values if isinstance(given, str | Path) else given
+    source_in_words = (
+        str(source) if isinstance(source, str | Path) else f"markers of camera {camera!r}"
+    )
+    table = read_csv(Path(source)).values if isinstance(source, str | Path) else source
     if not isinstance(table, Mapping):
         raise InputError(
-            f"{of}: got {show(given)}; expected a table with the columns {COLUMNS}, or its path, "
+            f"{source_in_words}: got {show(source)}; expected a table with the columns {COLUMNS}, "
+            "or its path, "
             "or images"
         )
     for name in ("frame", "x", "y"):
         if name not in table:
-            raise InputError(f"{of}: column {name!r} is missing; expected columns: {COLUMNS}")
+            raise InputError(
+                f"{source_in_words}: column {name!r} is missing; expected columns: {COLUMNS}"
+            )
     number = len(table["frame"])
     if not number:
-        raise InputError(f"{of}: no markers; expected rows with {COLUMNS}")
+        raise InputError(f"{source_in_words}: no markers; expected rows with {COLUMNS}")
     columns = [table.get(name, [""] * number) for name in ("frame", "marker", "x", "y", "sx", "sy")]
-    found, seen = [], set()
+    marks, frames_and_markers = [], set()
     for frame, name, x, y, *sigma in zip(*columns):
-        where = f"{of}, frame {frame}"
+        where = f"{source_in_words}, frame {frame}"
         xy = _numbers(x, y)
         if not np.isfinite(xy).all():
             raise InputError(f"{where}: got x {show(x)}, y {show(y)}; expected pixels")
-        own = _numbers(*(np.nan if is_missing(s) else s for s in sigma))
-        if not all(is_missing(s) or one > 0 for s, one in zip(sigma, own)):
+        sigma_xy = _numbers(*(np.nan if is_missing(s) else s for s in sigma))
+        if not all(is_missing(s) or sigma_value > 0 for s, sigma_value in zip(sigma, sigma_xy)):
             raise InputError(
                 f"{where}: got sx {show(sigma[0])}, sy {show(sigma[1])}; expected a positive σ in "
                 "pixels, or nothing"
             )
         marker = "" if is_missing(name) else str(name)
-        if marker and (str(frame), marker) in seen:
+        if marker and (str(frame), marker) in frames_and_markers:
             raise InputError(f"{where}: marker {marker!r} is there twice")
-        seen.add((str(frame), marker))
-        found.append(Mark(str(frame), marker, *xy, *own))
-    without = next((mark for mark in found if not mark.marker), None)
-    if without is not None and any(mark.marker for mark in found):
+        frames_and_markers.add((str(frame), marker))
+        marks.append(Mark(str(frame), marker, *xy, *sigma_xy))
+    nameless = next((mark for mark in marks if not mark.marker), None)
+    if nameless is not None and any(mark.marker for mark in marks):
         raise InputError(
-            f"{of}, frame {without.frame}: a marker has no name, others have; "
+            f"{source_in_words}, frame {nameless.frame}: a marker has no name, others have; "
             "expected a name for each, or for none"
         )
-    return found
+    return marks
 
 
 def _numbers(x: Any, y: Any) -> tuple[float, float]:
@@ -316,7 +335,9 @@ def _pairs(
     lengths: float | Mapping[tuple[str, str], float], marks: Mapping[str, Marks]
 ) -> dict[tuple[str, str], float]:
     """The known lengths by their markers."""
-    names = sorted({mark.marker for own in marks.values() for mark in own} - {""})
+    names = sorted(
+        {mark.marker for marks_of_camera in marks.values() for mark in marks_of_camera} - {""}
+    )
     if not isinstance(lengths, Mapping):
         # The markers of a wand of two need no names.
         names = names or ["A", "B"]
@@ -350,40 +371,42 @@ def _network(
 ) -> tuple[Network, list[str]]:
     """The network of all frames, of markers that two cameras see at least."""
     rays: dict[str, int] = {}
-    for own in marks.values():
-        for mark in own:
+    for marks_of_camera in marks.values():
+        for mark in marks_of_camera:
             point = f"{mark.frame}:{mark.marker}"
             rays[point] = rays.get(point, 0) + 1
     # One ray and one known distance are as many observations as a point has unknowns: such a point
     # would be met exactly, and on either of two places along its ray.
-    seen = {point for point, number in rays.items() if number > 1}
+    seen_points = {point for point, number in rays.items() if number > 1}
     rows = [
         (camera, f"{frame}:{name}", x, y, *(s if np.isfinite(s) else None for s in sigma))
-        for camera, own in marks.items()
-        for frame, name, x, y, *sigma in own
-        if f"{frame}:{name}" in seen
+        for camera, marks_of_camera in marks.items()
+        for frame, name, x, y, *sigma in marks_of_camera
+        if f"{frame}:{name}" in seen_points
     ]
-    frames = dict.fromkeys(mark.frame for own in marks.values() for mark in own)
-    known = [
+    frames = dict.fromkeys(
+        mark.frame for marks_of_camera in marks.values() for mark in marks_of_camera
+    )
+    known_lengths = [
         (f"{frame}:{a}", f"{frame}:{b}", length)
         for frame in frames
         for (a, b), length in pairs.items()
-        if {f"{frame}:{a}", f"{frame}:{b}"} <= seen
+        if {f"{frame}:{a}", f"{frame}:{b}"} <= seen_points
     ]
-    if not known:
+    if not known_lengths:
         raise InputError(
             "no frame shows both ends of a known length to two cameras: are frames of equal names "
             "simultaneous?"
         )
-    alone, names = len(rays) - len(seen), list(marks)
+    number_alone, names = len(rays) - len(seen_points), list(marks)
     network = make_network(
         [dataclasses.replace(cameras[name], id=name) for name in names],
         {"id": names, "camera": names},
-        {"id": sorted(seen), "role": ["tie"] * len(seen)},
+        {"id": sorted(seen_points), "role": ["tie"] * len(seen_points)},
         dict(zip(("image", "point", "x", "y", "sx", "sy"), map(list, zip(*rows)))),
         {
-            **dict(zip(("from", "to", "value"), map(list, zip(*known)))),
-            "sigma": [sigma_length] * len(known),
+            **dict(zip(("from", "to", "value"), map(list, zip(*known_lengths)))),
+            "sigma": [sigma_length] * len(known_lengths),
         },
         datum="inner",
         residuals="measured",
@@ -393,5 +416,5 @@ def _network(
         angle_unit="deg",
         name="wand",
     )
-    said = f"{count(alone, 'marker')} seen by one camera only, not used"
-    return network, [said] * bool(alone)
+    remark = f"{count(number_alone, 'marker')} seen by one camera only, not used"
+    return network, [remark] * bool(number_alone)

@@ -106,13 +106,15 @@ class WandBody:
         # Any camera of both ties the frames; what is left is a matter of the adjustment.
         to_rig = np.linalg.inv(mountings[name]) @ pose
         adjustment = self.found.adjustment
-        at = dict(zip(adjustment.problem.network.points.id, np.asarray(adjustment.values["point"])))
-        frames = dict.fromkeys(id.rsplit(":", 1)[0] for id in at)
+        position_of = dict(
+            zip(adjustment.problem.network.points.id, np.asarray(adjustment.values["point"]))
+        )
+        frames = dict.fromkeys(id.rsplit(":", 1)[0] for id in position_of)
         ends = {frame: [f"{frame}:{end}" for end in self.ends] for frame in frames}
         return {
-            frame: np.array([at[id] for id in ids]) @ to_rig[:3, :3].T + to_rig[:3, 3]
+            frame: np.array([position_of[id] for id in ids]) @ to_rig[:3, :3].T + to_rig[:3, 3]
             for frame, ids in ends.items()
-            if all(id in at for id in ids)
+            if all(id in position_of for id in ids)
         }
 
 
@@ -126,26 +128,29 @@ def start_wand(
 
     **Raises:** `InputError` naming camera, frame and marker; `NotSolvedError` if the cameras do not
     hang together by the wand."""
-    own = {name: wand.cameras[name] for name in wand.markers if name in wand.cameras}
+    wand_cameras = {name: wand.cameras[name] for name in wand.markers if name in wand.cameras}
     for name in wand.markers:
-        if name in own and name in calibrations:
+        if name in wand_cameras and name in calibrations:
             raise InputError(
                 f"wand: camera {name!r} sees boards, which give its interior orientation; omit it "
                 "from cameras"
             )
-    known = own | {name: one.camera for name, one in calibrations.items()}
-    missing = [name for name in wand.markers if name not in known]
-    if missing:
+    known_cameras = wand_cameras | {
+        name: calibration.camera for name, calibration in calibrations.items()
+    }
+    missing_cameras = [name for name in wand.markers if name not in known_cameras]
+    if missing_cameras:
         raise InputError(
-            f"wand: camera {missing[0]!r} sees no board; expected its interior orientation in "
+            f"wand: camera {missing_cameras[0]!r} sees no board; expected its interior "
+            "orientation in "
             "cameras (--cameras)"
         )
     # Their interior orientation is that of the boards; the wand alone would weaken it.
     hold = lambda camera: dataclasses.replace(camera, free=(), sigma={}, observed={})
-    known = {name: hold(known[name]) for name in wand.markers}
-    found = calibrate_wand(
+    known_cameras = {name: hold(known_cameras[name]) for name in wand.markers}
+    wand_calibration = calibrate_wand(
         wand.markers,
-        known,
+        known_cameras,
         wand.lengths,
         sigma_length=wand.sigma_length,
         sigma_image=wand.sigma_image,
@@ -155,9 +160,11 @@ def start_wand(
         progress=progress,
         snooping="pope",
     )
-    ends, length, sigma = _ends(found.lengths, wand.sigma_length)
-    own = {name: dataclasses.replace(known[name], id=name) for name in own}
-    return WandBody(found, own, ends, length, sigma, wand.sigma_image or 1.0)
+    ends, length, sigma = _ends(wand_calibration.lengths, wand.sigma_length)
+    wand_cameras = {
+        name: dataclasses.replace(known_cameras[name], id=name) for name in wand_cameras
+    }
+    return WandBody(wand_calibration, wand_cameras, ends, length, sigma, wand.sigma_image or 1.0)
 
 
 def _ends(
@@ -165,16 +172,18 @@ def _ends(
 ) -> tuple[tuple[str, str], float, float]:
     """The two markers farthest apart, their distance and its σ: given, or the sum of two lengths
     from a marker between them."""
-    found = {pair: (length, sigma) for pair, length in lengths.items()}
+    lengths_found = {pair: (length, sigma) for pair, length in lengths.items()}
     names = {name for pair in lengths for name in pair}
     for middle in names:
-        of = {next(iter({*pair} - {middle})): x for pair, x in lengths.items() if middle in pair}
+        length_to_middle = {
+            next(iter({*pair} - {middle})): x for pair, x in lengths.items() if middle in pair
+        }
         # Three in a line: of the third length, if it is not given, the other two are the parts.
-        if len(names) == 3 and len(lengths) == 2 and len(of) == 2:
-            (one, a), (other, b) = of.items()
-            found[one, other] = a + b, sigma * np.sqrt(2)
-    ends = max(found, key=lambda pair: found[pair][0])
-    return ends, *found[ends]
+        if len(names) == 3 and len(lengths) == 2 and len(length_to_middle) == 2:
+            (end_a, a), (end_b, b) = length_to_middle.items()
+            lengths_found[end_a, end_b] = a + b, sigma * np.sqrt(2)
+    ends = max(lengths_found, key=lambda pair: lengths_found[pair][0])
+    return ends, *lengths_found[ends]
 
 
 def add_wand(
@@ -183,16 +192,20 @@ def add_wand(
     """A rig with the wand as its last body, and the frames in which two cameras saw both ends."""
     names = [camera.id for camera in rig.cameras]
     ends = wand.points(dict(zip(names, connections.mountings)))
-    seen: dict[str, list[tuple[int, int, Any]]] = {frame: [] for frame in ends}
+    marks_of_frame: dict[str, list[tuple[int, int, Any]]] = {frame: [] for frame in ends}
     for name, marks in wand.found.markers.items():
         for mark in marks:
-            if mark.frame in seen and mark.marker in wand.ends:
+            if mark.frame in marks_of_frame and mark.marker in wand.ends:
                 point = len(rig.ids) + wand.ends.index(mark.marker)
-                seen[mark.frame].append((names.index(name), point, mark))
+                marks_of_frame[mark.frame].append((names.index(name), point, mark))
     # Two markers in two cameras: with fewer rays a pose of five unknowns is not checked.
-    frames = [frame for frame, rows in seen.items() if len(rows) >= 4]
+    frames = [frame for frame, rows in marks_of_frame.items() if len(rows) >= 4]
     poses = np.array([_stick_to_rig(*ends[frame]) for frame in frames])
-    rows = [(len(rig.epochs) + e, *row) for e, frame in enumerate(frames) for row in seen[frame]]
+    rows = [
+        (len(rig.epochs) + e, *row)
+        for e, frame in enumerate(frames)
+        for row in marks_of_frame[frame]
+    ]
     epoch, camera, point, marks = zip(*rows)
     xy, sigma = _in_units(rig, np.array(camera), marks, wand, calibrations)
     pose = pose_values([*poses])
@@ -201,7 +214,7 @@ def add_wand(
     if place is not None:
         # The wand has no place of its own beside its body's: the identity.
         place = join(place, PoseValue(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])))
-    half = wand.length / 2
+    half_length = wand.length / 2
     labels = [f"{BODY} {frame}" for frame in frames]
     number = len(rig.boards)
     return dataclasses.replace(
@@ -210,7 +223,7 @@ def add_wand(
         times=(*rig.epoch_of_rows, *labels),
         pose=join(rig.pose, pose),
         ids=(*rig.ids, *(f"{BODY}:{end}" for end in wand.ends)),
-        points=np.concatenate([rig.points, [[-half, 0, 0], [half, 0, 0]]]),
+        points=np.concatenate([rig.points, [[-half_length, 0, 0], [half_length, 0, 0]]]),
         epoch=np.concatenate([rig.epoch, epoch]),
         camera=np.concatenate([rig.camera, camera]),
         point=np.concatenate([rig.point, point]),
@@ -233,8 +246,11 @@ def add_wand(
 
 def _sigma0(calibrations: Mapping[str, Calibration]) -> float:
     """The σ0 that the image points of the boards have."""
-    found = [(one.adjustment.sigma0, one.adjustment.redundancy) for one in calibrations.values()]
-    sigma0, redundancy = np.array(found).T
+    sigma0_and_redundancy = [
+        (calibration.adjustment.sigma0, calibration.adjustment.redundancy)
+        for calibration in calibrations.values()
+    ]
+    sigma0, redundancy = np.array(sigma0_and_redundancy).T
     return float(np.sqrt((redundancy * sigma0**2).sum() / redundancy.sum()))
 
 
@@ -257,14 +273,16 @@ def _in_units(
     """Coordinates and σ of markers in the units of the models, σ in proportion to those of the
     boards."""
     uv = np.array([(mark.x, mark.y) for mark in marks])
-    own = np.array([(mark.sx, mark.sy) for mark in marks])
+    own_sigma = np.array([(mark.sx, mark.sy) for mark in marks])
     # As large as the residuals of the wand's network say.
-    sigma = np.where(np.isfinite(own), own, wand.sigma_image)
+    sigma = np.where(np.isfinite(own_sigma), own_sigma, wand.sigma_image)
     sigma = sigma * wand.found.adjustment.sigma0 / _sigma0(calibrations)
     xy = np.empty_like(uv)
     for k in np.unique(camera):
-        one, rows = rig.cameras[k], camera == k
-        model = get_model(one.model)
-        xy[rows] = in_model_units(uv[rows], model, one.image_size, one.pixel_size)
-        sigma[rows] *= unit_size(model, one.pixel_size)
+        camera_of_rig, rows = rig.cameras[k], camera == k
+        model = get_model(camera_of_rig.model)
+        xy[rows] = in_model_units(
+            uv[rows], model, camera_of_rig.image_size, camera_of_rig.pixel_size
+        )
+        sigma[rows] *= unit_size(model, camera_of_rig.pixel_size)
     return xy, sigma

@@ -28,60 +28,74 @@ SEARCHING = "searching the wand"
 TABLES = (".csv", ".txt", ".tsv")
 
 
-def are_images(given: Any) -> bool:
+def are_images(source: Any) -> bool:
     """Whether what is given of a camera are images, not a table of markers."""
-    if isinstance(given, str | Path):
-        return Path(given).suffix.lower() not in TABLES
-    return isinstance(given, Sequence) and all(isinstance(one, str | Path) for one in given)
+    if isinstance(source, str | Path):
+        return Path(source).suffix.lower() not in TABLES
+    return isinstance(source, Sequence) and all(isinstance(path, str | Path) for path in source)
 
 
 def measure_wand(
-    given: Mapping[str, Any],
+    sources: Mapping[str, Any],
     cameras: Mapping[str, Camera],
-    others: Mapping[str, Sequence[str]],
+    given_frames: Mapping[str, Sequence[str]],
     settings: BlobSettings,
     progress: Progress | None = None,
 ) -> tuple[dict[str, Marks], list[str]]:
     """The markers in the images of every camera, without names, and what was not used.
 
-    **Arguments:** `given`: by camera a folder, photographs, or a video; `others`: frames of the
-    cameras whose markers are given, to pair frames by their names.
+    **Arguments:** `sources`: by camera a folder, photographs, or a video; `given_frames`: frames of
+    the cameras whose markers are given, to pair frames by their names.
 
     **Raises:** `InputError` naming camera and file."""
-    frames = {camera: _Frames(images) for camera, images in given.items()}
-    found: dict[str, Marks] = {}
+    frames = {camera: _Frames(images) for camera, images in sources.items()}
+    marks_found: dict[str, Marks] = {}
     notes = []
-    for camera, own in frames.items():
+    for camera, frames_of_camera in frames.items():
         try:
-            marks, crowded = _measure(camera, own, cameras[camera], settings, progress)
+            marks, crowded = _measure(camera, frames_of_camera, cameras[camera], settings, progress)
         except InputError as error:
             raise InputError(f"camera {camera!r}: {error}") from None
         if not marks:
             kind = "dark" if settings.dark else "bright"
             raise InputError(
-                f"camera {camera!r}: no {kind} marker found in {count(own.number, 'frame')}"
+                f"camera {camera!r}: no {kind} marker found in "
+                f"{count(frames_of_camera.number, 'frame')}"
             )
-        found[camera] = marks
+        marks_found[camera] = marks
         notes += [
             f"camera {camera!r}: {count(crowded, 'frame')} without markers, or with more than "
             f"{settings.max_blobs} blobs"
         ] * bool(crowded)
-    names = {camera: tuple(dict.fromkeys(m.frame for m in own)) for camera, own in found.items()}
-    keys = epoch_keys(names | {name: tuple(own) for name, own in others.items()}, connected=False)
-    by_camera = {camera: dict(zip(own, keys[camera])) for camera, own in names.items()}
+    names = {
+        camera: tuple(dict.fromkeys(m.frame for m in frames_of_camera))
+        for camera, frames_of_camera in marks_found.items()
+    }
+    keys = epoch_keys(
+        names | {name: tuple(frames_of_camera) for name, frames_of_camera in given_frames.items()},
+        connected=False,
+    )
+    by_camera = {
+        camera: dict(zip(frames_of_camera, keys[camera]))
+        for camera, frames_of_camera in names.items()
+    }
     return {
-        camera: [mark._replace(frame=by_camera[camera][mark.frame]) for mark in own]
-        for camera, own in found.items()
+        camera: [mark._replace(frame=by_camera[camera][mark.frame]) for mark in frames_of_camera]
+        for camera, frames_of_camera in marks_found.items()
     }, notes
 
 
 class _Frames:
     """The frames of a camera: name and grey values; read twice."""
 
-    def __init__(self, given: Any):
-        paths = [given] if isinstance(given, str | Path) else list(given)
-        only = Path(paths[0]) if len(paths) == 1 else None
-        self.video = only if only and only.is_file() and not is_photograph(only) else None
+    def __init__(self, source: Any):
+        paths = [source] if isinstance(source, str | Path) else list(source)
+        single_path = Path(paths[0]) if len(paths) == 1 else None
+        self.video = (
+            single_path
+            if single_path and single_path.is_file() and not is_photograph(single_path)
+            else None
+        )
         self.files = {} if self.video else name_photographs(photographs(paths))
         self.number = len(self.files)
 
@@ -99,26 +113,26 @@ class _Frames:
 def _measure(
     camera: str,
     frames: _Frames,
-    known: Camera,
+    camera_known: Camera,
     settings: BlobSettings,
     progress: Progress | None,
 ) -> tuple[Marks, int]:
     """The markers of a camera, and the number of frames without any."""
     scene = find_still_scene((grey for _, grey in frames), settings)
     size = scene.background.shape[::-1]
-    if known.image_size is not None and tuple(known.image_size) != size:
+    if camera_known.image_size is not None and tuple(camera_known.image_size) != size:
         raise InputError(
             "the frames have {} × {} pixels, its interior orientation is of {} × {}".format(
-                *size, *known.image_size
+                *size, *camera_known.image_size
             )
         )
     marks, without = [], 0
-    for done, (name, grey) in enumerate(frames, 1):
+    for number_done, (name, grey) in enumerate(frames, 1):
         targets = find_moving_blobs(grey, scene, settings)
         without += not targets
         marks += [Mark(name, "", *t.xy.tolist(), *t.sigma.tolist()) for t in targets]
         if progress is not None:
-            progress(f"{SEARCHING}, camera {camera}", done, frames.number)
+            progress(f"{SEARCHING}, camera {camera}", number_done, frames.number)
     return marks, without
 
 

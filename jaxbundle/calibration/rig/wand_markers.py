@@ -83,14 +83,20 @@ def name_markers(
     """The markers of all cameras with names, and what was not used.
 
     **Raises:** `InputError` if markers without names cannot be told apart."""
-    found, notes = dict(marks), []
-    nameless = [camera for camera, own in marks.items() if own and not own[0].marker]
+    named_marks, notes = dict(marks), []
+    nameless = [
+        camera
+        for camera, marks_of_camera in marks.items()
+        if marks_of_camera and not marks_of_camera[0].marker
+    ]
     if nameless and len({name for pair in pairs for name in pair}) == 2:
-        return _name_two(found, nameless, cameras, settings)
+        return _name_two(named_marks, nameless, cameras, settings)
     for camera in nameless:
-        found[camera], said = name_three(camera, marks[camera], cameras[camera], pairs, settings)
-        notes += said
-    return found, notes
+        named_marks[camera], remarks = name_three(
+            camera, marks[camera], cameras[camera], pairs, settings
+        )
+        notes += remarks
+    return named_marks, notes
 
 
 def name_three(
@@ -110,22 +116,23 @@ def name_three(
             "whose distances are given, can be told apart"
         )
     # The pair that is not given, or the longest, are the ends.
-    others = [frozenset(n for n in names if n != one) for one in names]
-    middle = max(range(3), key=lambda k: size.get(others[k], np.inf))
+    other_ends = [frozenset(n for n in names if n != end_name) for end_name in names]
+    middle = max(range(3), key=lambda k: size.get(other_ends[k], np.inf))
     ends = [name for name in names if name != names[middle]]
-    away = [size[frozenset((names[middle], end))] for end in ends]
-    if max(away) < settings.min_ratio * min(away):
+    distances = [size[frozenset((names[middle], end))] for end in ends]
+    if max(distances) < settings.min_ratio * min(distances):
         raise InputError(
             f"markers of camera {camera!r} have no names (marker), and the middle one is nearly "
-            f"half way between the others ({away[0]:g}, {away[1]:g}): they cannot be told apart"
+            f"half way between the others ({distances[0]:g}, {distances[1]:g}): they cannot be "
+            "told apart"
         )
-    near, far = ends if away[0] < away[1] else ends[::-1]
-    found: Marks = []
+    near_end, far_end = ends if distances[0] < distances[1] else ends[::-1]
+    named_marks: Marks = []
     seen_ratios: list[float] = []
     without = ambiguous = 0
-    ratio, depth = max(away) / min(away), settings.depth_ratio
-    for seen in _by_frame(marks).values():
-        uv = np.array([(mark.x, mark.y) for mark in seen])
+    ratio, depth = max(distances) / min(distances), settings.depth_ratio
+    for marks_of_frame in _by_frame(marks).values():
+        uv = np.array([(mark.x, mark.y) for mark in marks_of_frame])
         straight = _straight_triples(uv, interior, settings)
         # Perspective changes the ratio by that of the depths of both ends, to either side.
         possible = [rows for rows, observed in straight if 1 / depth < observed / ratio < depth]
@@ -134,15 +141,15 @@ def name_three(
         # For the message where none fits: a wrong length in the table shows in this ratio.
         seen_ratios += [observed for _, observed in straight]
         if len(possible) == 1:
-            by = zip((near, names[middle], far), possible[0])
-            found += [seen[k]._replace(marker=name) for name, k in by]
-    if not found:
+            names_and_rows = zip((near_end, names[middle], far_end), possible[0])
+            named_marks += [marks_of_frame[k]._replace(marker=name) for name, k in names_and_rows]
+    if not named_marks:
         usual = f"; those in a line are at 1 : {np.median(seen_ratios):.1f}" if seen_ratios else ""
         raise InputError(
             f"camera {camera!r}: no frame shows three markers in a line whose distances from the "
             f"middle one are as 1 : {ratio:.2f}{usual}"
         )
-    said = [
+    remarks = [
         f"camera {camera!r}: {count(number, 'frame')} {why} not used"
         for number, why in (
             (without, "without three markers in a line at the ratio of the wand"),
@@ -150,7 +157,7 @@ def name_three(
         )
         if number
     ]
-    return found, said
+    return named_marks, remarks
 
 
 def _straight_triples(
@@ -158,29 +165,33 @@ def _straight_triples(
 ) -> list[tuple[tuple[int, int, int], float]]:
     """Three blobs in a line, as rows of the near end, the middle and the far end, and the ratio of
     the distances of far and near end from the middle."""
-    xy, found = ideal_features(interior, uv), []
+    xy, triples = ideal_features(interior, uv), []
     for rows in combinations(range(len(uv)), 3):
-        apart = {pair: np.linalg.norm(uv[pair[0]] - uv[pair[1]]) for pair in combinations(rows, 2)}
-        if min(apart.values()) < settings.min_distance or not np.isfinite(xy[[*rows]]).all():
+        distance_of = {
+            pair: np.linalg.norm(uv[pair[0]] - uv[pair[1]]) for pair in combinations(rows, 2)
+        }
+        if min(distance_of.values()) < settings.min_distance or not np.isfinite(xy[[*rows]]).all():
             continue
         # The ends are farthest from each other.
-        near, far = max(apart, key=lambda pair: apart[pair])
-        (middle,) = {*rows} - {near, far}
-        line, a, b = xy[far] - xy[near], xy[middle] - xy[near], xy[middle] - xy[far]
+        near_end, far_end = max(distance_of, key=lambda pair: distance_of[pair])
+        (middle,) = {*rows} - {near_end, far_end}
+        line, a, b = xy[far_end] - xy[near_end], xy[middle] - xy[near_end], xy[middle] - xy[far_end]
         bend = abs(line[0] * a[1] - line[1] * a[0]) / (line @ line)
         # The near end is that beside the middle marker.
         if np.linalg.norm(a) > np.linalg.norm(b):
-            near, far, a, b = far, near, b, a
+            near_end, far_end, a, b = far_end, near_end, b, a
         if bend < settings.max_bend:
-            found.append(((near, middle, far), float(np.linalg.norm(b) / np.linalg.norm(a))))
-    return found
+            triples.append(
+                ((near_end, middle, far_end), float(np.linalg.norm(b) / np.linalg.norm(a)))
+            )
+    return triples
 
 
 def _by_frame(marks: Marks) -> ByFrame:
-    found: ByFrame = {}
+    frames: ByFrame = {}
     for mark in marks:
-        found.setdefault(mark.frame, []).append(mark)
-    return found
+        frames.setdefault(mark.frame, []).append(mark)
+    return frames
 
 
 def _name_two(
@@ -195,62 +206,71 @@ def _name_two(
     # "A", "B" of named cameras in alphabetical order: they come first and decide
     frames = {
         camera: {
-            frame: sorted(seen, key=lambda mark: mark.marker)
-            for frame, seen in _by_frame(own).items()
-            if len(seen) == 2
+            frame: sorted(marks_of_frame, key=lambda mark: mark.marker)
+            for frame, marks_of_frame in _by_frame(marks_of_camera).items()
+            if len(marks_of_frame) == 2
         }
-        for camera, own in marks.items()
+        for camera, marks_of_camera in marks.items()
     }
-    named = {mark.marker for own in marks.values() for mark in own} - {""}
-    names = sorted(named) if len(named) == 2 else ["A", "B"]
+    names_given = {
+        mark.marker for marks_of_camera in marks.values() for mark in marks_of_camera
+    } - {""}
+    names = sorted(names_given) if len(names_given) == 2 else ["A", "B"]
     xy = {
         camera: {
-            frame: ideal_features(cameras[camera], np.array([(m.x, m.y) for m in seen]))
-            for frame, seen in own.items()
+            frame: ideal_features(cameras[camera], np.array([(m.x, m.y) for m in marks_of_frame]))
+            for frame, marks_of_frame in marks_of_camera.items()
         }
-        for camera, own in frames.items()
+        for camera, marks_of_camera in frames.items()
     }
     # Rays have c = 1, the tolerance is in pixels.
     tolerance = {camera: settings.tolerance * _pixel(cameras[camera]) for camera in marks}
     turns: dict[tuple[str, str], Turns] = {}
-    for one, other in combinations(marks, 2):
-        if one in nameless or other in nameless:
-            limit = max(tolerance[one], tolerance[other])
-            turns[one, other] = _turns_of_pair(xy[one], xy[other], limit, settings)
+    for camera_a, camera_b in combinations(marks, 2):
+        if camera_a in nameless or camera_b in nameless:
+            limit = max(tolerance[camera_a], tolerance[camera_b])
+            turns[camera_a, camera_b] = _turns_of_pair(xy[camera_a], xy[camera_b], limit, settings)
         else:
-            turns[one, other] = dict.fromkeys(frames[one].keys() & frames[other].keys(), False)
-    found: dict[str, Marks] = {camera: [] for camera in marks}
-    left = contradicting = 0
+            turns[camera_a, camera_b] = dict.fromkeys(
+                frames[camera_a].keys() & frames[camera_b].keys(), False
+            )
+    named_marks: dict[str, Marks] = {camera: [] for camera in marks}
+    undecided = contradicting = 0
     # Named cameras first: the others follow their names.
     order = [*(c for c in marks if c not in nameless), *nameless]
-    for frame in dict.fromkeys(frame for own in frames.values() for frame in own):
+    for frame in dict.fromkeys(
+        frame for marks_of_camera in frames.values() for frame in marks_of_camera
+    ):
         seeing = [camera for camera in order if frame in frames[camera]]
         turned = _turns_of_frame(frame, seeing, turns)
         contradicting += turned is None
-        left += turned is not None and len(turned) < len(seeing)
+        undecided += turned is not None and len(turned) < len(seeing)
         for camera, turn in (turned or {}).items():
             pair = frames[camera][frame][:: -1 if turn else 1]
-            found[camera] += [m._replace(marker=name) for m, name in zip(pair, names)]
-    said = [
+            named_marks[camera] += [m._replace(marker=name) for m, name in zip(pair, names)]
+    remarks = [
         f"{count(number, 'frame')} {why} not used"
         for number, why in (
-            (left, "in which the rays of some cameras do not tell the two markers apart, there"),
+            (
+                undecided,
+                "in which the rays of some cameras do not tell the two markers apart, there",
+            ),
             (contradicting, "in which pairs of cameras tell the two markers apart differently"),
         )
         if number
     ]
-    for camera, own in marks.items():
-        number = len(_by_frame(own)) - len(frames[camera])
-        said += [
+    for camera, marks_of_camera in marks.items():
+        number = len(_by_frame(marks_of_camera)) - len(frames[camera])
+        remarks += [
             f"camera {camera!r}: {count(number, 'frame')} without two markers not used"
         ] * bool(number)
-    if not any(found.values()):
+    if not any(named_marks.values()):
         raise InputError(
             "the two markers look alike, and the rays of no two cameras tell them apart: expected "
             "15 or more frames in which two cameras see both, at different places and in different "
             "directions; or names (marker), or a wand of three markers at uneven distances"
         )
-    return found, said
+    return named_marks, remarks
 
 
 def _pixel(camera: Camera) -> float:
@@ -260,30 +280,32 @@ def _pixel(camera: Camera) -> float:
 
 
 def _turns_of_pair(
-    one: Mapping[str, Float[np.ndarray, "2 2"]],
-    other: Mapping[str, Float[np.ndarray, "2 2"]],
+    marks_a: Mapping[str, Float[np.ndarray, "2 2"]],
+    marks_b: Mapping[str, Float[np.ndarray, "2 2"]],
     tolerance: float,
     settings: WandSettings,
 ) -> Turns:
     """Of the common frames of two cameras whose assignment is clear, which it is."""
     common = [
-        frame for frame in one if frame in other and np.isfinite([one[frame], other[frame]]).all()
+        frame
+        for frame in marks_a
+        if frame in marks_b and np.isfinite([marks_a[frame], marks_b[frame]]).all()
     ]
     # 5 points determine an orientation and 5 frames have 20 pairings, half of them wrong; with
     # three times as many a wrong one does not agree by chance
     if len(common) < 15:
         return {}
-    a = np.array([one[frame] for frame in common])
-    b = np.array([other[frame] for frame in common])
+    a = np.array([marks_a[frame] for frame in common])
+    b = np.array([marks_b[frame] for frame in common])
     # Straight pairings, and crossed ones.
-    first, second = np.concatenate([a, a]), np.concatenate([b, b[:, ::-1]])
+    points_a, points_b = np.concatenate([a, a]), np.concatenate([b, b[:, ::-1]])
     # Mixed, since a search with gross errors may take the first ones for good.
     mixed = np.random.default_rng(0).permutation(4 * len(common))
-    xy1, xy2 = first.reshape(-1, 2)[mixed], second.reshape(-1, 2)[mixed]
+    xy1, xy2 = points_a.reshape(-1, 2)[mixed], points_b.reshape(-1, 2)[mixed]
     M, base, _, _ = batched.orient_pairs([xy1], [xy2], np.array([tolerance]))
     distances = jax.vmap(sampson_distance, (None, None, 0, 0))
-    off = np.abs(distances(M[0], base[0], first.reshape(-1, 2), second.reshape(-1, 2)))
-    fits = np.asarray((off.reshape(2, -1, 2) < tolerance).all(2))
+    distance = np.abs(distances(M[0], base[0], points_a.reshape(-1, 2), points_b.reshape(-1, 2)))
+    fits = np.asarray((distance.reshape(2, -1, 2) < tolerance).all(2))
     # Both fit where the wand lies in the epipolar plane: nothing tells them apart there.
     clear = fits[0] != fits[1]
     if clear.mean() < settings.min_agreeing:
@@ -296,27 +318,27 @@ def _turns_of_frame(
 ) -> dict[str, bool] | None:
     """Of the cameras of a frame that hang together, which have the other order; None if pairs of
     them contradict each other."""
-    known: dict[tuple[str, str], bool] = {}
-    for (one, other), of_pair in turns.items():
+    turn_of_pair: dict[tuple[str, str], bool] = {}
+    for (camera_a, camera_b), of_pair in turns.items():
         if frame in of_pair:
-            known[one, other] = known[other, one] = of_pair[frame]
+            turn_of_pair[camera_a, camera_b] = turn_of_pair[camera_b, camera_a] = of_pair[frame]
     best: dict[str, bool] = {}
     for start in cameras:
         if start in best:
             continue
-        found, reached = {start: False}, [start]
+        turn_of_camera, reached = {start: False}, [start]
         for camera in reached:
-            for other in cameras:
-                if (camera, other) not in known:
+            for camera_b in cameras:
+                if (camera, camera_b) not in turn_of_pair:
                     continue
-                turn = found[camera] ^ known[camera, other]
-                if other not in found:
-                    found[other] = turn
-                    reached.append(other)
+                turn = turn_of_camera[camera] ^ turn_of_pair[camera, camera_b]
+                if camera_b not in turn_of_camera:
+                    turn_of_camera[camera_b] = turn
+                    reached.append(camera_b)
                 # A loop of cameras that does not close: one of its pairs is wrong.
-                elif found[other] != turn:
+                elif turn_of_camera[camera_b] != turn:
                     return None
         # The largest group stands for the frame; others have no order in common with it.
-        if len(found) > len(best):
-            best = found
+        if len(turn_of_camera) > len(best):
+            best = turn_of_camera
     return best if len(best) > 1 else {}
