@@ -62,18 +62,18 @@ class Converted:
     def __str__(self) -> str:
         lines = [f"{', '.join(map(str, self.parts or (self.path,)))}: {self.kind}"]
         costs = sorted(self.conversions.items(), key=lambda item: -item[1].largest)
-        shown = 8  # the worst, on one screen; `conversions` has all
-        lines += [f"camera {id!r} → {cost}" for id, cost in costs[:shown]]
-        if len(costs) > shown:
-            lines.append(f"and {len(costs) - shown} more cameras, with smaller differences")
+        max_shown = 8  # the worst, on one screen; `conversions` has all
+        lines += [f"camera {id!r} → {cost}" for id, cost in costs[:max_shown]]
+        if len(costs) > max_shown:
+            lines.append(f"and {len(costs) - max_shown} more cameras, with smaller differences")
         lines += describe_lost(self.lost)
         lines += [f"warning: {warning}" for warning in self.warnings]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
-def describe_lost(lost: Sequence[str]) -> list[str]:
+def describe_lost(losses: Sequence[str]) -> list[str]:
     """The line about what is not kept; none if nothing is lost."""
-    return [f"not kept: {'; '.join(lost)}"] if lost else []
+    return [f"not kept: {'; '.join(losses)}"] if losses else []
 
 
 def convert(  # noqa: PLR0913, as the options of the command
@@ -124,9 +124,9 @@ def convert(  # noqa: PLR0913, as the options of the command
         if kind in TARGETS and TARGETS[kind].alone:
             network = network_of_cameras(cameras, str(input)).warn(*fit_messages(cameras))
             return _convert_network(network, output, kind, model, measured, force, (), tell)
-        made = _convert_cameras(input, cameras, output, kind, model, camera, tell)
+        conversion = _convert_cameras(input, cameras, output, kind, model, camera, tell)
         return dataclasses.replace(
-            made, warnings=(*fit_messages(cameras), *outside_warnings(cameras))
+            conversion, warnings=(*fit_messages(cameras), *outside_warnings(cameras))
         )
     network = read_network(
         input,
@@ -147,12 +147,12 @@ def convert(  # noqa: PLR0913, as the options of the command
             # The fit over the measurements needs the network; then there is nothing to convert.
             network, costs = convert_cameras(network, model, measured=True)
             model = None
-        made = _convert_cameras(
+        conversion = _convert_cameras(
             input, network.cameras, output, kind, model, camera, tell, network, unread
         )
         return dataclasses.replace(
-            made,
-            conversions=made.conversions if costs is None else costs,
+            conversion,
+            conversions=conversion.conversions if costs is None else costs,
             warnings=network.warnings,
             notes=network.notes,
         )
@@ -173,18 +173,18 @@ def _convert_network(
 ) -> Converted:
     network, costs = _with_model(network, kind, model, measured)
     folder, files = _folder(output, kind), TARGETS[kind].files
-    told = (*describe_losses(network, TARGETS[kind].losses), *unread)
-    tell(told)
+    losses_told = (*describe_losses(network, TARGETS[kind].losses), *unread)
+    tell(losses_told)
     if folder is None:
-        lost = TARGETS[kind].write(network, output)
+        losses = TARGETS[kind].write(network, output)
     else:
         with replace_folder(folder, "convert", files, force) as new:
-            lost = TARGETS[kind].write(network, new)
+            losses = TARGETS[kind].write(network, new)
     parts = tuple(path for path in _parts(network, output, kind) if path.exists())
     parts = () if parts == (output,) else parts
     # A writer may meet more than the format loses by itself.
-    lost = (*told, *(what for what in lost if what not in told))
-    return Converted(kind, output, costs, lost, network.warnings, network.notes, parts)
+    losses = (*losses_told, *(loss for loss in losses if loss not in losses_told))
+    return Converted(kind, output, costs, losses, network.warnings, network.notes, parts)
 
 
 def _parts(network: Network, output: Path, kind: str) -> tuple[Path, ...]:
@@ -199,13 +199,13 @@ def _choose_kind(output: Path, to: str | None) -> str:
         if to not in kinds:
             raise InputError(f"--to {to}: cannot be written{did_you_mean(to, kinds)}")
         return to
-    found = recognise_target(output)
-    if found is None:
-        known = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
+    recognised = recognise_target(output)
+    if recognised is None:
+        known_kinds = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
         raise InputError(
-            f"{output}: the output format is not recognised; give --to or a name: {known}"
+            f"{output}: the output format is not recognised; give --to or a name: {known_kinds}"
         )
-    return found
+    return recognised
 
 
 def _add_sizes(
@@ -215,7 +215,7 @@ def _add_sizes(
 ) -> tuple[Camera, ...]:
     """The cameras, with sizes added if missing."""
     sizes = {"image_size": image_size, "pixel_size": pixel_size}
-    made = tuple(
+    with_sizes = tuple(
         dataclasses.replace(
             camera,
             **{
@@ -226,9 +226,9 @@ def _add_sizes(
         )
         for camera in cameras
     )
-    for camera in made:
+    for camera in with_sizes:
         check_camera(camera)
-    return made
+    return with_sizes
 
 
 def _check_path(output: Path, kind: str) -> None:
@@ -254,21 +254,21 @@ def _keep_input(
         *network.further,
     )
     # Real paths: an output may be the input by a link, or by a path with `..`.
-    read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
-    folders = {os.path.realpath(Path(p).parent) for p in read}
-    written = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
+    input_files = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
+    folders = {os.path.realpath(Path(p).parent) for p in input_files}
+    output_files = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
     if kind == "csv":
-        written.add(os.path.realpath(images_path(output)))
+        output_files.add(os.path.realpath(images_path(output)))
     folder = _folder(output, kind)
     if folder is not None and os.path.realpath(folder) in folders:
-        written |= read  # who replaces the folder of an input replaces the input
+        output_files |= input_files  # who replaces the folder of an input replaces the input
     if control is not None:
-        read.add(os.path.realpath(control))
-    _refuse_overlap(read, written, output)
+        input_files.add(os.path.realpath(control))
+    _refuse_overlap(input_files, output_files, output)
 
 
-def _refuse_overlap(read: set[str], written: set[str], output: Path) -> None:
-    if read & written:
+def _refuse_overlap(input_files: set[str], output_files: set[str], output: Path) -> None:
+    if input_files & output_files:
         raise InputError(f"{output} is the input and would be overwritten; give another place")
 
 
@@ -292,10 +292,10 @@ def _keep_others(output: Path, kind: str, force: bool, network: Network | None =
         "jaicov": [output.with_suffix(suffix) for suffix in COMPANION_SUFFIXES],
     }
     files = (output,) if network is None else _parts(network, output, kind)
-    there = [path for path in (*files, *beside.get(kind, [])) if os.path.lexists(path)]
-    if there and not force:
+    existing = [path for path in (*files, *beside.get(kind, [])) if os.path.lexists(path)]
+    if existing and not force:
         raise InputError(
-            f"{list_some([str(path) for path in there], 3, str)}: already there and would be "
+            f"{list_some([str(path) for path in existing], 3, str)}: already there and would be "
             "replaced; give another place, or --force"
         )
 
@@ -347,25 +347,27 @@ def _convert_cameras(
             f"{', '.join((*CAMERA_KINDS, *(name for name, t in TARGETS.items() if t.alone)))}, not "
             f"as {kind}"
         )
-    written = CAMERA_KINDS[kind]
-    if written.one or id is not None:
+    camera_kind = CAMERA_KINDS[kind]
+    if camera_kind.one or id is not None:
         cameras = [choose_camera(cameras, id, str(input))]
-    costs, made = {}, []
+    costs, converted_cameras = {}, []
     for camera in cameras:
-        foreign = not has_model(written.models, camera.model)
-        target = model or (written.models[0] if foreign else camera.model)
+        foreign = not has_model(camera_kind.models, camera.model)
+        target = model or (camera_kind.models[0] if foreign else camera.model)
         if target != camera.model:
             converted, costs[camera.id] = convert_one(camera, target)
             if model is None:
                 _refuse_inexact(cameras, camera.id, kind, costs[camera.id])
             camera = converted
-        made.append(camera)
+        converted_cameras.append(camera)
     if network is None:
-        lost = describe_losses(network_of_cameras(made, str(input)), written.losses)
+        lost = describe_losses(
+            network_of_cameras(converted_cameras, str(input)), camera_kind.losses
+        )
     else:
-        losses = {**FILES_OF_CAMERAS, **written.losses}
-        lost = describe_losses(network.replace(cameras=tuple(made)), losses)
+        losses = {**FILES_OF_CAMERAS, **camera_kind.losses}
+        lost = describe_losses(network.replace(cameras=tuple(converted_cameras)), losses)
     lost = (*lost, *unread)
     tell(lost)
-    written.write(made, output)
+    camera_kind.write(converted_cameras, output)
     return Converted(kind, output, costs, lost, ())

@@ -166,13 +166,13 @@ class CameraTarget:
 
 def _cameras_losing(names: Callable[[Sequence[str]], Sequence[object]] | None = None) -> Losses:
     """The losses of a file of cameras; `names`: those that they get."""
-    lost = ("pixel sizes of cameras", "prior σ of camera parameters")
+    lost_names = ("pixel sizes of cameras", "prior σ of camera parameters")
     renamed: Losses = {}
     if names is not None:
         renamed = {
             "names of cameras": lambda n: changed(ids := [c.id for c in n.cameras], names(ids))
         }
-    return renamed | {name: QUANTITIES[name] for name in lost}
+    return renamed | {name: QUANTITIES[name] for name in lost_names}
 
 
 def _is_project(path: Path) -> bool:
@@ -187,9 +187,9 @@ def _is_photo_list(path: Path) -> bool:
         return False
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         # Empty lines may stand before the number; the limit bounds the memory for any other file.
-        first = next((line for line in file.read(100_000).split("\n") if line.strip()), "")
+        first_line = next((line for line in file.read(100_000).split("\n") if line.strip()), "")
     try:
-        float(first)
+        float(first_line)
     except ValueError:
         return False
     return True
@@ -587,9 +587,9 @@ def read_network(
         )
     if format is not None and text("format", format) not in FORMATS:
         if format in TARGETS or format == "opencv":
-            what = "contains only a camera" if format == "opencv" else "is written only"
+            restriction = "contains only a camera" if format == "opencv" else "is written only"
             raise InputError(
-                f"--format {format}: {what}; a network is read as {', '.join(FORMATS)}"
+                f"--format {format}: {restriction}; a network is read as {', '.join(FORMATS)}"
             )
         raise InputError(f"unknown format {format!r}{did_you_mean(format, FORMATS)}")
     if not os.path.exists(file_of_line(path)):
@@ -601,16 +601,16 @@ def read_network(
             "or another network (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
-        if known := describe_incomplete(path):
-            raise InputError(f"{path}: {known}")
+        if incomplete := describe_incomplete(path):
+            raise InputError(f"{path}: {incomplete}")
         raise InputError(f"{path}: the kind of input is not recognised; {expected_inputs(path)}")
     # Read before the network, which may take long: its errors come at once.
     control_points = None if control is None else read_control(control)
     # Other formats have names of their own for their models.
-    own = (check_own_models(models),) if FORMATS[format].names_models else ()
+    own_models = (check_own_models(models),) if FORMATS[format].names_models else ()
     sized = image_size is not None and FORMATS[format].takes_image_size
     sizes = {"image_size": image_size} if sized else {}
-    network = FORMATS[format].read(path, overrides, *own, **sizes)
+    network = FORMATS[format].read(path, overrides, *own_models, **sizes)
     if control_points is not None:
         return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
@@ -637,7 +637,9 @@ def describe_incomplete(path: Path) -> str:
             "such as out_camera_data.xml, not its settings or images"
         )
     head = beginning(path, 1000)
-    return next((said for mark, said in OTHER_KINDS.items() if re.search(mark, head)), "")
+    return next(
+        (description for mark, description in OTHER_KINDS.items() if re.search(mark, head)), ""
+    )
 
 
 def expected_inputs(path: Path) -> str:
@@ -669,11 +671,11 @@ def _with_adjusted_control(network: Network) -> Network:
     """The network with a warning about already adjusted control points, and a note about held
     ones."""
     points = network.points
-    held = [id for id, role in zip(points.id, points.role) if role == "fixed"]
+    held_ids = [id for id, role in zip(points.id, points.role) if role == "fixed"]
     weighted = points.role.count("control")
-    if held:
-        points = count(len(held), "control point")
-        network = network.note(f"{points} without positive σ held as fixed: {list_some(held)}")
+    if held_ids:
+        points = count(len(held_ids), "control point")
+        network = network.note(f"{points} without positive σ held as fixed: {list_some(held_ids)}")
     if weighted:
         network = network.warn(
             f"the file gives {count(weighted, 'control point')} with adjusted coordinates and a "

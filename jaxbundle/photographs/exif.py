@@ -75,9 +75,9 @@ class Exif:
     @property
     def camera(self) -> str:
         """Make and model without repetition."""
-        first = self.make.split()[:1]
-        repeated = first and self.model.lower().startswith(first[0].lower())
-        return (self.model if repeated else f"{self.make} {self.model}").strip()
+        first_word = self.make.split()[:1]
+        is_repeated = first_word and self.model.lower().startswith(first_word[0].lower())
+        return (self.model if is_repeated else f"{self.make} {self.model}").strip()
 
     def principal_distance(self) -> StatedDistance | None:
         """The principal distance in pixels of this file, whatever the size of the photograph as it
@@ -123,12 +123,15 @@ def read_exif(path: str | Path) -> Exif:
     resolution = _positive(details.get(Tag.FocalPlaneXResolution))
     unit = RESOLUTION_UNIT.get(details.get(Tag.FocalPlaneResolutionUnit, 2))
     sides = (Tag.ExifImageWidth, Tag.ExifImageHeight)
-    taken = sorted(_positive(details.get(side)) or 0 for side in sides)
-    if resolution and taken[1]:
+    exposed_sides = sorted(_positive(details.get(side)) or 0 for side in sides)
+    if resolution and exposed_sides[1]:
         # Of the original photograph: programs that reduce it usually keep this.
-        resolution *= max(size) / taken[1]
+        resolution *= max(size) / exposed_sides[1]
     # The ratio of the sides differs by up to 2 % without a crop, from rounding and borders.
-    cropped = taken[0] > 0 and abs(math.log(taken[1] / taken[0] * min(size) / max(size))) > 0.02
+    cropped = (
+        exposed_sides[0] > 0
+        and abs(math.log(exposed_sides[1] / exposed_sides[0] * min(size) / max(size))) > 0.02
+    )
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     date = details.get(Tag.DateTimeOriginal) or head.get(Tag.DateTime)
     return Exif(
@@ -187,11 +190,11 @@ def _place(gps: Mapping[int, Any], xmp: Xmp) -> GeographicPosition | None:
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         return None
     height = _number(gps.get(GPS.GPSAltitude))
-    below = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
+    is_below = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
     return GeographicPosition(
         latitude,
         longitude,
-        None if height is None else -height if below else height,
+        None if height is None else -height if is_below else height,
         xmp.sigma or _positive(gps.get(GPS.GPSHPositioningError)),
         xmp.sigma_height,
     )

@@ -18,29 +18,37 @@ def list_photographs(folder: Path) -> list[Path]:
     """The photographs in a folder, by name: also those whose format cannot be read."""
     files = [p for p in _visible(folder) if p.is_file() and is_photograph(p)]
     # Raw and JPEG of one exposure have one name; the raw file alone is listed, and refused by name.
-    read = {p.stem.lower() for p in files if p.suffix.lower() in SUFFIXES}
-    return [p for p in files if p.suffix.lower() not in RAW or p.stem.lower() not in read]
+    readable_stems = {p.stem.lower() for p in files if p.suffix.lower() in SUFFIXES}
+    return [p for p in files if p.suffix.lower() not in RAW or p.stem.lower() not in readable_stems]
 
 
 def describe_other_files(folder: Path) -> str:
     """The files and folders that are no photographs of their own, in words; empty if none."""
-    used, most = set(list_photographs(folder)), 6  # names in a message of one or two lines
-    others = [p for p in _visible(folder) if p not in used]
-    inside = [p for p in others if p.is_dir() and any(map(is_photograph, _visible(p)))]
-    raw = [p for p in others if p.is_file() and p.suffix.lower() in RAW]
-    rest = [p for p in others if p.is_file() and p not in raw]
-    said = []
+    photographs, max_names = (
+        set(list_photographs(folder)),
+        6,
+    )  # names in a message of one or two lines
+    other_files = [p for p in _visible(folder) if p not in photographs]
+    folders_with_photographs = [
+        p for p in other_files if p.is_dir() and any(map(is_photograph, _visible(p)))
+    ]
+    raw = [p for p in other_files if p.is_file() and p.suffix.lower() in RAW]
+    remaining = [p for p in other_files if p.is_file() and p not in raw]
+    descriptions = []
     if raw:
-        said.append(f"{count(len(raw), 'raw file')} beside photographs of the same name")
-    if inside:
-        names = ", ".join(f"{p.name}/" for p in inside[:most])
-        said.append(f"{count(len(inside), 'folder')} with photographs ({names}); give them, too")
-    if rest:
-        kinds = Counter(p.suffix.lower() or "no suffix" for p in rest)
-        some = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common(most))
-        more = ", …" if len(kinds) > most else ""
-        said.append(f"{count(len(rest), 'other file')} ({some}{more})")
-    return f"{folder}: not read: {'; '.join(said)}" if said else ""
+        descriptions.append(f"{count(len(raw), 'raw file')} beside photographs of the same name")
+    if folders_with_photographs:
+        names = ", ".join(f"{p.name}/" for p in folders_with_photographs[:max_names])
+        descriptions.append(
+            f"{count(len(folders_with_photographs), 'folder')} with photographs ({names}); give "
+            "them, too"
+        )
+    if remaining:
+        kinds = Counter(p.suffix.lower() or "no suffix" for p in remaining)
+        common_kinds = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common(max_names))
+        ellipsis = ", …" if len(kinds) > max_names else ""
+        descriptions.append(f"{count(len(remaining), 'other file')} ({common_kinds}{ellipsis})")
+    return f"{folder}: not read: {'; '.join(descriptions)}" if descriptions else ""
 
 
 def _visible(folder: Path) -> list[Path]:

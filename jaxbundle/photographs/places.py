@@ -53,30 +53,30 @@ def map_positions(
 ) -> MapPositions | None:
     """Positions in a projected system in metres, default the UTM zone; None if they are fewer than
     three, or the system has another unit."""
-    there = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
-    if len(there) < 3:
+    placed = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
+    if len(placed) < 3:
         return None
-    rows, known = [k for k, _ in there], [place for _, place in there]
-    latitude = np.array([p.latitude for p in known])
-    longitude = np.array([p.longitude for p in known])
+    rows, known_places = [k for k, _ in placed], [place for _, place in placed]
+    latitude = np.array([p.latitude for p in known_places])
+    longitude = np.array([p.longitude for p in known_places])
     system = system or utm_system(float(np.median(latitude)), float(np.median(longitude)))
     axis = _need_pyproj().CRS.from_user_input(system).axis_info[0]
     if axis.unit_conversion_factor != 1:
         return None
     x, y = _transformer("EPSG:4326", system, "positions").transform(longitude, latitude)
-    height = np.array([p.height for p in known], float)
-    sigma = np.array([p.sigma or SIGMA for p in known])
-    spread = np.hypot(np.ptp(x), np.ptp(y))
+    height = np.array([p.height for p in known_places], float)
+    sigma = np.array([p.sigma or SIGMA for p in known_places])
+    extent = np.hypot(np.ptp(x), np.ptp(y))
     X, s = np.full((len(places), 3), np.nan), np.full((len(places), 3), np.nan)
     X[rows] = np.stack([x, y, height], 1)
-    high = [p.sigma_height or plane * SIGMA_HEIGHT / SIGMA for p, plane in zip(known, sigma)]
+    high = [p.sigma_height or plane * SIGMA_HEIGHT / SIGMA for p, plane in zip(known_places, sigma)]
     s[rows] = np.stack([sigma, sigma, high], 1)
     turn = np.full(len(places), np.nan)
     factors = _need_pyproj().Proj(system).get_factors(longitude, latitude)
     turn[rows] = factors.meridian_convergence
     # Over 8 σ three positions determine the direction to √2·σ/8σ = 10 degrees and the scale to 18 %
-    wide = bool(spread > 8 * np.median(sigma))
-    return MapPositions(X, s, turn, system, wide)
+    is_wide = bool(extent > 8 * np.median(sigma))
+    return MapPositions(X, s, turn, system, is_wide)
 
 
 def to_map(
@@ -93,14 +93,16 @@ def to_map(
         return X, f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}"
     pyproj = _need_pyproj()
     try:
-        known = pyproj.CRS.from_user_input("EPSG:4326" if system.upper() == "WGS84" else system)
+        known_system = pyproj.CRS.from_user_input(
+            "EPSG:4326" if system.upper() == "WGS84" else system
+        )
     except pyproj.exceptions.ProjError:
         raise InputError(f"{where}: coordinate system {system!r} is not known") from None
-    if not known.is_geographic:
-        code = known.to_epsg()
-        return X, f"EPSG:{code}" if code else known.to_string()
+    if not known_system.is_geographic:
+        code = known_system.to_epsg()
+        return X, f"EPSG:{code}" if code else known_system.to_string()
     target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
-    x, y = _transformer(known, target, where).transform(X[:, 0], X[:, 1])
+    x, y = _transformer(known_system, target, where).transform(X[:, 0], X[:, 1])
     return np.stack([x, y, X[:, 2]], 1), target
 
 

@@ -88,8 +88,8 @@ def _read(
     if _looks_cut(content):
         _refuse_cut(path, content)
     _refuse_hollow(path, len(content))
-    way = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
-    flags = way | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    colour_flag = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
+    flags = colour_flag | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if pixels is None:
         pixels = _read_by_pillow(path, content, colour)

@@ -72,7 +72,7 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
     sharpness, thumbnails = [], []
     with _opened(path) as video:
         rate = float(video.get(cv2.CAP_PROP_FPS))
-        stated = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 1)
+        stated_number = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 1)
         for grey in _grey_frames(video):
             small = _reduce(grey, settings.side).astype(np.float32)
             # Of the same view at another exposure it is the same; blur does not change the mean.
@@ -80,7 +80,9 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
             tiny = _reduce(small, settings.thumbnail).ravel()
             thumbnails.append((tiny - tiny.mean()) / max(float(tiny.std()), 1.0))
             if len(sharpness) % 32 == 0:
-                progress(f"frames of {path.name}", min(len(sharpness), stated), stated)
+                progress(
+                    f"frames of {path.name}", min(len(sharpness), stated_number), stated_number
+                )
     if not sharpness:
         raise InputError(f"{path}: a video without frames")
     # Some containers state no rate.
@@ -108,16 +110,16 @@ def choose_frames(
         )
     pictures = [v.thumbnail[f : f + length][candidates] for v, f in zip(videos, first)]
     change = np.full(len(candidates), np.inf)
-    chosen: list[int] = []
+    chosen_frames: list[int] = []
     # Begins with the sharpest, relative to the brightness of its own video.
     best = int(np.argmax(videos[0].sharpness[first[0] : first[0] + length][candidates]))
-    while len(chosen) < settings.number and change[best] >= settings.min_change:
-        chosen.append(best)
+    while len(chosen_frames) < settings.number and change[best] >= settings.min_change:
+        chosen_frames.append(best)
         # New in one video is new.
         difference = [np.sqrt(((p - p[best]) ** 2).mean(1)) for p in pictures]
         change = np.minimum(change, np.max(difference, axis=0))
         best = int(np.argmax(change))
-    return np.sort(candidates[chosen])
+    return np.sort(candidates[chosen_frames])
 
 
 def frames_of_video(path: Path) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
@@ -143,22 +145,22 @@ def write_frames(path: Path, numbers: Int[np.ndarray, " n"], first: int, folder:
 
     **Raises:** `InputError` if the video ends before."""
     cv2 = need_opencv()
-    wanted, written = set(numbers.tolist()), 0
+    wanted_frames, number_written = set(numbers.tolist()), 0
     folder.mkdir()
     with _opened(path) as video:
         # One by one: to jump to a frame is inexact with most codecs.
         for number in range(int(numbers.max(initial=-1)) + 1):
             if not video.grab():
                 break
-            if number in wanted:
-                there, frame = video.retrieve()
+            if number in wanted_frames:
+                is_there, frame = video.retrieve()
                 file = folder / file_of_frame(number - first)
-                if not there:
+                if not is_there:
                     break
                 content = cv2.imencode(".png", frame)[1]
                 file.write_bytes(content.tobytes())
-                written += 1
-    if written < len(wanted):
+                number_written += 1
+    if number_written < len(wanted_frames):
         raise InputError(f"{path}: ends before frame {numbers.max()}, which was there before")
 
 
@@ -179,8 +181,8 @@ def _opened(path: Path) -> Iterator[Any]:
 def _grey_frames(video: Any) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
     cv2 = need_opencv()
     while True:
-        there, frame = video.read()
-        if not there:
+        is_there, frame = video.read()
+        if not is_there:
             return
         yield cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
 

@@ -74,8 +74,8 @@ def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.
 
 
 def _attitude(number: Callable[[str], float | None]) -> CameraAttitude | None:
-    stated = _largest([number(f"IMU{axis}Accuracy") for axis in PIX4D])
-    sigma = stated if stated and stated > 0 else SIGMA_ATTITUDE
+    stated_sigma = _largest([number(f"IMU{axis}Accuracy") for axis in PIX4D])
+    sigma = stated_sigma if stated_sigma and stated_sigma > 0 else SIGMA_ATTITUDE
     # The pitch of the horizon is 0 in DJI's tags, 90 in Pix4D's.
     for names, horizon in ((DJI, 0.0), (PIX4D, 90.0)):
         angles = [angle for angle in map(number, names) if angle is not None]
@@ -90,18 +90,22 @@ def _fields(packet: bytes | str) -> Mapping[str, str]:
     """Attributes and elements by their names without namespace, the first of each."""
     content = packet if isinstance(packet, bytes) else packet.encode()
     # Packets have 64 KB at most within JPEG; a megabyte is far beyond what drones write.
-    whole = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[: 2**20], re.DOTALL)
+    rdf_match = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[: 2**20], re.DOTALL)
     # Entities may grow without limit ("billion laughs"); no camera uses them.
-    head = content[: whole.start()] if whole else b""
-    if whole is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
+    head = content[: rdf_match.start()] if rdf_match else b""
+    if rdf_match is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
         return {}
     # Some drones declare namespaces outside the part that is read.
     spaces = dict(re.findall(r'xmlns:(\w+)="([^"]*)"', head.decode(errors="replace")))
-    text = whole[0].decode(errors="replace")
+    text = rdf_match[0].decode(errors="replace")
     opening = re.match(r"<[\w:]+", text)
-    missing = "".join(f' xmlns:{s}="{u}"' for s, u in spaces.items() if f"xmlns:{s}=" not in text)
+    missing_spaces = "".join(
+        f' xmlns:{s}="{u}"' for s, u in spaces.items() if f"xmlns:{s}=" not in text
+    )
     try:
-        root = ET.fromstring(opening[0] + missing + text[opening.end() :] if opening else text)
+        root = ET.fromstring(
+            opening[0] + missing_spaces + text[opening.end() :] if opening else text
+        )
     except ET.ParseError:
         return {}
     fields: dict[str, str] = {}
@@ -122,5 +126,5 @@ def _number(text: str | None) -> float | None:
 
 
 def _largest(values: Sequence[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return max(known) if known else None
+    known_values = [v for v in values if v is not None]
+    return max(known_values) if known_values else None

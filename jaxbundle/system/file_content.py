@@ -41,9 +41,9 @@ def check_plain(path: str | Path) -> None:
         real = os.path.realpath(path)
     except (OSError, ValueError):
         return  # reported when it is opened
-    given = path.parent in DESCRIPTORS and stat.S_ISFIFO(mode)
+    is_given_pipe = path.parent in DESCRIPTORS and stat.S_ISFIFO(mode)
     system = stat.S_ISREG(mode) and real.startswith(SYSTEM)
-    if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or given):
+    if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or is_given_pipe):
         raise InputError(f"{path}: a file of the system, a device or a pipe; give a plain file")
 
 

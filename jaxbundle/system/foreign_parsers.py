@@ -48,8 +48,8 @@ def _describe(error: BaseException, expected: str) -> str:
         )
     if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EIO):
         return f"cannot be read: {error.strerror}"
-    said = " ".join(str(error).split())[:200]
-    kind = "" if said else type(error).__name__
+    message = " ".join(str(error).split())[:200]
+    kind = "" if message else type(error).__name__
     # The bare text of a KeyError is only the key.
-    said = f"no {said}" if isinstance(error, KeyError) else said
-    return f"is not {expected}, or is damaged: {said or kind}"
+    message = f"no {message}" if isinstance(error, KeyError) else message
+    return f"is not {expected}, or is damaged: {message or kind}"

@@ -70,9 +70,9 @@ def handle_interrupts() -> None:
     _open_standard_streams()
     _screen = os.dup(2)
     atexit.register(_leave)  # the first to be registered is the last to be called
-    read, writer = _open_channel()
+    read_byte, writer = _open_channel()
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    threading.Thread(target=_watch, args=(read,), daemon=True).start()
+    threading.Thread(target=_watch, args=(read_byte,), daemon=True).start()
 
 
 def _open_channel() -> "tuple[Callable[[], bytes], int]":
@@ -84,10 +84,10 @@ def _open_channel() -> "tuple[Callable[[], bytes], int]":
         return lambda: os.read(reader, 1), writer
     import socket
 
-    ours, theirs = socket.socketpair()
-    theirs.setblocking(False)
-    _kept.append(theirs)
-    return lambda: ours.recv(1), theirs.fileno()
+    our_end, their_end = socket.socketpair()
+    their_end.setblocking(False)
+    _kept.append(their_end)
+    return lambda: our_end.recv(1), their_end.fileno()
 
 
 # Sockets that must stay open as long as the process.
@@ -113,18 +113,18 @@ def _handle(number: int, _frame: object) -> None:
         _end(number)
 
 
-def _watch(read: "Callable[[], bytes]") -> None:
+def _watch(read_byte: "Callable[[], bytes]") -> None:
     """Wait for the byte that Python writes on a signal, independently of the main thread."""
     import threading
 
     number = 0
     while number not in WORDS:
-        number = read()[0]
+        number = read_byte()[0]
     time.sleep(GRACE)
     # The disk does not answer.
-    last = threading.Timer(2 * LONGEST_DEFERRAL, _say_and_exit, (number,))
-    last.daemon = True
-    last.start()
+    last_resort = threading.Timer(2 * LONGEST_DEFERRAL, _say_and_exit, (number,))
+    last_resort.daemon = True
+    last_resort.start()
     _end(number)
 
 

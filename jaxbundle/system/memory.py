@@ -38,12 +38,12 @@ def require_address_space(command: str = "") -> None:
     error that can be caught.
 
     **Raises:** `MemoryError`."""
-    left = _of_the_address_space()
+    bytes_left = _of_the_address_space()
     needed = SMALLEST_ADDRESS_SPACE.get(command, SMALLEST_ADDRESS_SPACE[""])
-    if left < needed:
+    if bytes_left < needed:
         raise MemoryError(
             f"not enough memory: the limit of the address space (ulimit -v) leaves "
-            f"{left / 1e9:.2f} GB; at least {needed / 1e9:.2f} GB are needed: raise it"
+            f"{bytes_left / 1e9:.2f} GB; at least {needed / 1e9:.2f} GB are needed: raise it"
         )
 
 
@@ -53,14 +53,14 @@ def is_memory_shortage(error: BaseException) -> bool:
         return True
     if isinstance(error, OSError):
         return error.errno == errno.ENOMEM
-    said = str(error).lower()
-    return not isinstance(error, ValueError) and any(words in said for words in SHORTAGES)
+    message = str(error).lower()
+    return not isinstance(error, ValueError) and any(words in message for words in SHORTAGES)
 
 
 def left_in_control_groups(root: str | Path = "/") -> float:
     """Bytes left in the control groups of this process, of version 1 or 2, below a root folder:
     limit − usage, without cached files, which the system drops when others need the memory."""
-    left = math.inf
+    bytes_left = math.inf
     for line in _read(Path(root, "proc/self/cgroup")).splitlines():
         _, controllers, group = (*line.split(":", 2), "", "")[:3]
         # Version 2 has one line, "0::/group"; version 1 one for each controller.
@@ -71,12 +71,12 @@ def left_in_control_groups(root: str | Path = "/") -> float:
         if not controllers:
             names = ("memory.max", "memory.current", "inactive_file")
         # A container may see its own group as the root of the mounted tree.
-        inside = mounted / group.lstrip("/")
+        own_folder = mounted / group.lstrip("/")
         # The limit of every enclosing group applies, too: the least of them counts.
-        for folder in dict.fromkeys((inside, *inside.parents, mounted)):
+        for folder in dict.fromkeys((own_folder, *own_folder.parents, mounted)):
             if folder == mounted or mounted in folder.parents:
-                left = min(left, _left_in(folder, *names))
-    return left
+                bytes_left = min(bytes_left, _left_in(folder, *names))
+    return bytes_left
 
 
 def return_freed_memory() -> None:
@@ -90,11 +90,11 @@ def return_freed_memory() -> None:
 
 
 def _left_in(folder: Path, limit: str, usage: str, cached: str) -> float:
-    most, used = (_read(folder / name).strip() for name in (limit, usage))
-    if not (most.isdecimal() and used.isdecimal()) or int(most) >= NO_LIMIT:
+    limit_words, used_words = (_read(folder / name).strip() for name in (limit, usage))
+    if not (limit_words.isdecimal() and used_words.isdecimal()) or int(limit_words) >= NO_LIMIT:
         return math.inf
     # Cached files are counted as used, and are given up when memory is asked for.
-    return int(most) - int(used) + _field(_read(folder / "memory.stat"), cached, 0.0)
+    return int(limit_words) - int(used_words) + _field(_read(folder / "memory.stat"), cached, 0.0)
 
 
 def _of_the_machine() -> float:

@@ -206,12 +206,12 @@ def check_raw(path: str | Path, source: "DatasetReader") -> None:
         )
 
 
-def as_type(values: np.ndarray, dtype: np.dtype | str, missing: float | None = None) -> np.ndarray:
-    """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes `missing`;
+def as_type(values: np.ndarray, dtype: np.dtype | str, no_data: float | None = None) -> np.ndarray:
+    """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes `no_data`;
     None: NaN stays, and is 0 of whole numbers."""
     if np.issubdtype(dtype, np.floating):
-        filled = values if missing is None else np.where(np.isnan(values), missing, values)
+        filled = values if no_data is None else np.where(np.isnan(values), no_data, values)
         return filled.astype(dtype)
     limits = np.iinfo(dtype)
-    filled = np.where(np.isnan(values), missing or 0, np.rint(values))
+    filled = np.where(np.isnan(values), no_data or 0, np.rint(values))
     return np.clip(filled, limits.min, limits.max).astype(dtype)

@@ -94,18 +94,18 @@ def _remove(name: str, content: bool) -> None:
             os.unlink(name)
             return
         for folder, folders, files in os.walk(name, topdown=False) if content else ():
-            for one in (*files, *folders):
-                path = os.path.join(folder, one)
+            for entry in (*files, *folders):
+                path = os.path.join(folder, entry)
                 with suppress(OSError):
-                    os.unlink(path) if one in files or os.path.islink(path) else os.rmdir(path)
+                    os.unlink(path) if entry in files or os.path.islink(path) else os.rmdir(path)
         os.rmdir(name)
 
 
 def _remove_open_files(folders: set[str]) -> None:
     """Remove the files directly in the folders that are open (known on Linux)."""
     descriptors = "/proc/self/fd"
-    for one in os.listdir(descriptors) if folders and os.path.isdir(descriptors) else ():
+    for descriptor in os.listdir(descriptors) if folders and os.path.isdir(descriptors) else ():
         with suppress(OSError):
-            path = os.readlink(os.path.join(descriptors, one))
+            path = os.readlink(os.path.join(descriptors, descriptor))
             if os.path.dirname(path) in folders:
                 os.unlink(path)

@@ -61,9 +61,9 @@ def for_printing(text: str) -> str:
     return for_output(text) if strict else text
 
 
-def _escape(found: re.Match) -> str:
+def _escape(match: re.Match) -> str:
     # JSON escapes are units of UTF-16: letters beyond U+FFFF have two.
-    units = found[0].encode("utf-16-be")
+    units = match[0].encode("utf-16-be")
     return "".join(f"\\u{units[i : i + 2].hex()}" for i in range(0, len(units), 2))
 
 

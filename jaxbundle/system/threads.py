@@ -26,9 +26,11 @@ def map_in_threads(
                 raise
             return NO_MEMORY
 
-    found = []
+    results = []
     with ThreadPoolExecutor(at_once) as pool:
-        for one in pool.map(attempt, items):
-            found.append(one)
-            advance(len(found))
-    return [function(item) if one is NO_MEMORY else one for item, one in zip(items, found)]
+        for result in pool.map(attempt, items):
+            results.append(result)
+            advance(len(results))
+    return [
+        function(item) if result is NO_MEMORY else result for item, result in zip(items, results)
+    ]

@@ -50,17 +50,19 @@ class Workers:
 
     def run(self, tasks: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
         """Every task with its result or `Failed`, in the order of completion."""
-        left = list(tasks)[::-1]
-        while left or self._busy:
-            while left and len(self._busy) < self._number:
+        tasks_left = list(tasks)[::-1]
+        while tasks_left or self._busy:
+            while tasks_left and len(self._busy) < self._number:
                 connection, process = self._idle.pop() if self._idle else self._start()
                 try:
-                    connection.send(left[-1])
+                    connection.send(tasks_left[-1])
                 except OSError:  # it died without work
                     continue
-                self._busy[connection] = process, left.pop()
+                self._busy[connection] = process, tasks_left.pop()
             ready = wait([*self._busy])
-            for connection in [one for one in self._busy if one in ready]:
+            for connection in [
+                busy_connection for busy_connection in self._busy if busy_connection in ready
+            ]:
                 process, task = self._busy.pop(connection)
                 try:
                     result = connection.recv()
@@ -74,12 +76,12 @@ class Workers:
 
     def _start(self) -> tuple[Any, Any]:
         context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, self._function), daemon=True)
+        our_end, their_end = context.Pipe()
+        process = context.Process(target=_serve, args=(their_end, self._function), daemon=True)
         process.start()
         watch_process(process)
-        theirs.close()
-        return ours, process
+        their_end.close()
+        return our_end, process
 
 
 def _describe_end(process: BaseProcess) -> str:
@@ -96,8 +98,8 @@ def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
             try:
                 result = function(task)
             except Exception as error:
-                named = isinstance(error, MemoryError) and str(error)
-                result = Failed(named or f"{type(error).__name__}: {error}")
+                message = isinstance(error, MemoryError) and str(error)
+                result = Failed(message or f"{type(error).__name__}: {error}")
             connection.send(result)
     except (EOFError, OSError):
         os._exit(0)  # the parent process is gone

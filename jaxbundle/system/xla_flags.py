@@ -30,10 +30,10 @@ TRIED = (0, 12)
 def set_flags(compile_quickly: bool) -> None:
     """Add the flags above that this jaxlib knows and that the variable does not set."""
     flags = os.environ.get("XLA_FLAGS", "").split()
-    said = {flag.partition("=")[0] for flag in flags}
-    ours = [QUICK_LOOPS, ONE_AFTER_THE_OTHER, *[LITTLE_OPTIMISATION] * compile_quickly]
-    ours = [flag for flag in _known(ours) if flag.partition("=")[0] not in said]
-    os.environ["XLA_FLAGS"] = " ".join(flags + ours)
+    names_set = {flag.partition("=")[0] for flag in flags}
+    our_flags = [QUICK_LOOPS, ONE_AFTER_THE_OTHER, *[LITTLE_OPTIMISATION] * compile_quickly]
+    our_flags = [flag for flag in _known(our_flags) if flag.partition("=")[0] not in names_set]
+    os.environ["XLA_FLAGS"] = " ".join(flags + our_flags)
 
 
 def jaxlib_version() -> tuple[int, ...]:

@@ -57,7 +57,7 @@ def read_boards(path: str | Path) -> BoardFile:
             f"{path}: no boards; expected a section for each, such as [board.front] with columns, "
             "rows and square"
         )
-    found = BoardFile({}, {}, {})
+    board_file = BoardFile({}, {}, {})
     for name, values in sections.items():
         where = f"{path}, [board.{name}]: "
         if not isinstance(values, dict):
@@ -66,31 +66,33 @@ def read_boards(path: str | Path) -> BoardFile:
             refuse_unknown(key, (*OF_BOARD, *OF_RIG), where)
         if ":" in name:
             raise InputError(f"{where}expected a name without a colon")
-        found.boards[name] = _board(path, where, values)
+        board_file.boards[name] = _board(path, where, values)
         if "body" in values:
-            found.bodies.setdefault(_text(where, "body", values["body"]), []).append(name)
+            board_file.bodies.setdefault(_text(where, "body", values["body"]), []).append(name)
         if "cameras" in values:
             cameras = values["cameras"]
             if not isinstance(cameras, list) or not cameras:
                 raise InputError(
                     f"{where}cameras is {show(cameras)}; expected a list of names of cameras"
                 )
-            found.seen_by[name] = [_text(where, "cameras", camera) for camera in cameras]
-    return found
+            board_file.seen_by[name] = [_text(where, "cameras", camera) for camera in cameras]
+    return board_file
 
 
 def _board(path: Path, where: str, values: dict[str, Any]) -> Board:
     """One board, or that of a target file."""
-    own = {key: value for key, value in values.items() if key in OF_BOARD}
+    keys_of_board = {key: value for key, value in values.items() if key in OF_BOARD}
     if "target" in values:
-        if own:
-            raise InputError(f"{where}target gives the whole board; omit {', '.join(own)}")
+        if keys_of_board:
+            raise InputError(
+                f"{where}target gives the whole board; omit {', '.join(keys_of_board)}"
+            )
         return read_target(path.parent / _text(where, "target", values["target"]))
     for key in ("columns", "rows", "square"):
-        if key not in own:
+        if key not in keys_of_board:
             raise InputError(f"{where}{key} is missing; expected columns, rows and square")
     with naming_file(where.removesuffix(": ")):  # a Board checks its own values
-        return Board(**own)
+        return Board(**keys_of_board)
 
 
 def _text(where: str, key: str, value: Any) -> str:

@@ -59,18 +59,18 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
         if cells.get("level", "0").isdigit() and int(cells.get("level", "0")) > 0:
             reduced[cells["filename"]] = None
     # One row of "-" stands for a whole photograph, unless the board itself has one point.
-    failed = [
+    failed_names = [
         name
         for name, points in views.items()
         if len(points) == 1 < number and np.isnan(points).all()
     ]
     for name, points in views.items():
-        if name not in failed and len(points) != number:
+        if name not in failed_names and len(points) != number:
             raise InputError(
                 f"{path}: photograph {name!r} has {len(points)} points; the board, {board}, has "
                 f"{number}"
             )
-    names = [name for name in views if name not in failed]
+    names = [name for name in views if name not in failed_names]
     xy = np.array([views[name] for name in names], float).reshape(-1, number, 2)
     w, h = (int(n) for n in image_size)
     warnings = ()
@@ -84,7 +84,7 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
         tuple(names),
         (w, h),
         xy,
-        tuple((name, "no board found") for name in failed),
+        tuple((name, "no board found") for name in failed_names),
         warnings,
     )
 
@@ -108,13 +108,13 @@ def write_corners(views: BoardViews, path: str | Path) -> None:
 
     **Raises:** `InputError` for names with blanks.
     """
-    failed = [name for name, _ in views.failed]
-    for name in (*views.names, *failed):
+    failed_names = [name for name, _ in views.failed]
+    for name in (*views.names, *failed_names):
         if any(character.isspace() for character in name) or name.startswith("#"):
             raise InputError(f"{path}: photograph {name!r}: a name cannot have blanks, nor begin #")
     lines = [f"# {' '.join(COLUMNS)} level"]
     for name, points in zip(views.names, views.xy.tolist()):
         # x != x: NaN, a point that was not found
         lines += [f"{name} - - -" if x != x else f"{name} {x!r} {y!r} 0" for x, y in points]
-    lines += [f"{name} - - -" for name in failed]
+    lines += [f"{name} - - -" for name in failed_names]
     write_text(Path(path), "\n".join(lines) + "\n")

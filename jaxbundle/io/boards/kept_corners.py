@@ -72,17 +72,21 @@ class KeptCorners:
             return ""
         # A name of bytes that are not UTF-8 has no text that SQLite would take.
         path = os.fsencode(os.path.abspath(photograph)).decode(errors="backslashreplace")
-        now = state.st_size, state.st_mtime_ns
-        known = self._first("SELECT size, changed, content FROM photographs WHERE path = ?", path)
+        size_and_time = state.st_size, state.st_mtime_ns
+        stored_row = self._first(
+            "SELECT size, changed, content FROM photographs WHERE path = ?", path
+        )
         # Reading thousands of photographs again would take minutes.
-        if known is not None and known[:2] == now:
-            return known[2]
+        if stored_row is not None and stored_row[:2] == size_and_time:
+            return stored_row[2]
         try:
-            read = read_content(photograph, text=False)
+            content_read = read_content(photograph, text=False)
         except InputError:
             return ""
-        content = hashlib.blake2b(read, digest_size=16).hexdigest()
-        self._write("INSERT OR REPLACE INTO photographs VALUES (?, ?, ?, ?)", path, *now, content)
+        content = hashlib.blake2b(content_read, digest_size=16).hexdigest()
+        self._write(
+            "INSERT OR REPLACE INTO photographs VALUES (?, ?, ?, ?)", path, *size_and_time, content
+        )
         return content
 
     def look(self, content: str, board: Board) -> Look | None:

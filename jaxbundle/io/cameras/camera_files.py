@@ -40,8 +40,8 @@ class CameraFormat:
     looks: str
 
 
-def _single(read: Callable[[Path], Camera]) -> Callable[[Path], Sequence[Camera]]:
-    return lambda path: (read(path),)
+def _single(read_camera: Callable[[Path], Camera]) -> Callable[[Path], Sequence[Camera]]:
+    return lambda path: (read_camera(path),)
 
 
 def _is_colmap_cameras(path: Path) -> bool:

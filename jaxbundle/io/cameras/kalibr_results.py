@@ -69,27 +69,27 @@ def _camera(path: Path, id: str, text: str) -> "Calibrated":
     model, core, coefficients = MODELS[kind]
     values, sigma = _values(where, "projection", text, core)
     if coefficients:
-        more = _values(where, "distortion", text, coefficients)
-        values, sigma = values | more[0], sigma | more[1]
+        distortion = _values(where, "distortion", text, coefficients)
+        values, sigma = values | distortion[0], sigma | distortion[1]
     (camera,) = make_cameras([{"id": id, "model": model, **values}], f"{path}, ")
     return camera, (list(sigma), np.diag(np.square([*sigma.values()])))
 
 
 def _values(
-    where: str, what: str, text: str, names: Sequence[str]
+    where: str, field: str, text: str, names: Sequence[str]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Values and σ of a line."""
-    found = re.search(VALUES.format(what), text)
-    if found is None:
-        raise InputError(f"{where}: {what}: [values] +- [σ] is missing")
+    match = re.search(VALUES.format(field), text)
+    if match is None:
+        raise InputError(f"{where}: {field}: [values] +- [σ] is missing")
     numbers = []
-    for part in found.groups():
+    for part in match.groups():
         words = part.replace(",", " ").split()
         if len(words) != len(names):
-            raise InputError(f"{where}: {what} has {len(words)} numbers; expected {len(names)}")
+            raise InputError(f"{where}: {field} has {len(words)} numbers; expected {len(names)}")
         row = TextRow(Path(where), 0, " ".join(words))
         try:
             numbers.append(dict(zip(names, row.numbers(names).tolist())))
         except InputError:
-            raise InputError(f"{where}: {what}: expected finite numbers") from None
+            raise InputError(f"{where}: {field}: expected finite numbers") from None
     return numbers[0], numbers[1]

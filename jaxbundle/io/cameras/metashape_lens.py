@@ -49,6 +49,6 @@ def read_metashape_lens(path: str | Path) -> Camera:
     calibration = ET.Element("calibration", {"class": "adjusted"})
     calibration.extend(element for element in root if element.tag not in KEYS.used[:3])
     sensor.append(calibration)
-    entry, told = sensor_camera(path, sensor)
+    entry, messages = sensor_camera(path, sensor)
     (camera,) = make_cameras([entry], f"{path}, ")
-    return with_messages(camera, *told, *unknown.messages())
+    return with_messages(camera, *messages, *unknown.messages())

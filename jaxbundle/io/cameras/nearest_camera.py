@@ -110,13 +110,17 @@ def nearest_camera(
     """
     sizes = (camera.image_size, camera.pixel_size)
     uv = image_grid([-0.5, -0.5], np.array(camera.image_size, float) - 0.5)
-    rays, there = _rays(camera, uv, settings)
-    if there.mean() < MEASURABLE:
+    rays, has_ray = _rays(camera, uv, settings)
+    if has_ray.mean() < MEASURABLE:
         raise NoPlaceError(
-            f"{where}: only {100 * there.mean():.0f} % of the image has rays: its distortion turns "
+            f"{where}: only {100 * has_ray.mean():.0f} % of the image has rays: its distortion "
+            "turns "
             "back inside the image"
         )
-    uv, rays = uv[there], rays[there] * [1, -1, -1]  # y up, looking along −z, as all models here
+    uv, rays = (
+        uv[has_ray],
+        rays[has_ray] * [1, -1, -1],
+    )  # y up, looking along −z, as all models here
     wide = (MIRROR if "xi" in camera.start else FISHEYE) if camera.fisheye else ()
     source = get_model(wide[0][0] if wide else "opencv")
     narrow = (-rays[:, 2] > np.cos(np.radians(settings.perspective_angle))).all()
@@ -133,21 +137,21 @@ def nearest_camera(
         except ValueError as error:
             problem = str(error)
             continue
-        off = np.linalg.norm((images_of(target, values, rays) - xy) * step, axis=1)
-        largest = float(off.max()) if np.isfinite(off).all() else np.inf
-        fits.append((largest, float(np.sqrt(np.mean(off**2))), target, values))
+        difference = np.linalg.norm((images_of(target, values, rays) - xy) * step, axis=1)
+        largest = float(difference.max()) if np.isfinite(difference).all() else np.inf
+        fits.append((largest, float(np.sqrt(np.mean(difference**2))), target, values))
         if largest <= settings.good_fit:
             break
     if not fits or not np.isfinite(min(fits, key=lambda fit: fit[0])[0]):
         raise NoPlaceError(f"{where}: no camera model fits it; {problem}")
     largest, rms, target, values = min(fits, key=lambda fit: fit[0])
     entry: dict[str, Any] = {"model": target.name, **values}
-    told = f"fitted as {target.name}, largest difference {largest:.2g} px, RMS {rms:.2g} px"
-    if there.mean() < 1:
-        told += f"; {100 * (1 - there.mean()):.1f} % of the image has no ray"
+    message = f"fitted as {target.name}, largest difference {largest:.2g} px, RMS {rms:.2g} px"
+    if has_ray.mean() < 1:
+        message += f"; {100 * (1 - has_ray.mean()):.1f} % of the image has no ray"
     if target.unit == "mm" and camera.pixel_size is not None:
         entry["pixel_size"] = list(camera.pixel_size)
-    return entry, told
+    return entry, message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,9 +164,9 @@ class FittedCamera(Camera):
 
 def with_messages(camera: Camera, *messages: str) -> Camera:
     """The camera with further messages, if there are any."""
-    told = "; ".join([*fit_messages([camera]), *messages])
+    joined_messages = "; ".join([*fit_messages([camera]), *messages])
     fields = {field.name: getattr(camera, field.name) for field in dataclasses.fields(Camera)}
-    return FittedCamera(**fields, told=told) if messages else camera
+    return FittedCamera(**fields, told=joined_messages) if messages else camera
 
 
 def fit_camera(
@@ -176,7 +180,7 @@ def fit_camera(
 
     **Raises:** `NoPlaceError`.
     """
-    entry, told = nearest_camera(camera, where, settings)
+    entry, message = nearest_camera(camera, where, settings)
     pixel = entry.pop("pixel_size", None)
     model, size = entry.pop("model"), camera.image_size
     return FittedCamera(
@@ -185,14 +189,14 @@ def fit_camera(
         entry,
         image_size=(int(size[0]), int(size[1])),
         pixel_size=pixel and tuple(pixel),
-        told=f"camera {id!r} {why}: {told}",
+        told=f"camera {id!r} {why}: {message}",
     )
 
 
 def fit_messages(cameras: Iterable[Camera]) -> tuple[str, ...]:
     """Messages about how cameras were read."""
-    told = (camera.told for camera in cameras if isinstance(camera, FittedCamera))
-    return tuple(dict.fromkeys(filter(None, told)))
+    messages = (camera.told for camera in cameras if isinstance(camera, FittedCamera))
+    return tuple(dict.fromkeys(filter(None, messages)))
 
 
 def _rays(

@@ -171,42 +171,42 @@ def read_opencv(
     path = Path(path)
     unknown = UnknownKeys()
     entries = _only_camera(path, read_entries(path), unknown) if entries is None else entries
-    found = camera_entries(entries, path, unknown)
+    by_meaning = camera_entries(entries, path, unknown)
     if id is None:
         # EuRoC: cam0/sensor.yaml
         id = path.stem if path.stem != "sensor" else path.resolve().parent.name
-    return with_messages(camera_of(path, found, id), *unknown.messages())
+    return with_messages(camera_of(path, by_meaning, id), *unknown.messages())
 
 
 def _only_camera(path: Path, entries: Mapping[str, Any], unknown: UnknownKeys) -> Mapping[str, Any]:
     """The entries of the camera, also where they stand within another object."""
     if has_camera(entries):
         return entries
-    inside = list(cameras_within(entries))
-    if len(inside) != 1 or meaning_of(*inside[0]) == "camera_matrix":
+    nested_cameras = list(cameras_within(entries))
+    if len(nested_cameras) != 1 or meaning_of(*nested_cameras[0]) == "camera_matrix":
         return entries
-    name, own = inside[0]
+    name, entries_of_camera = nested_cameras[0]
     # {"camera": {…}, "software": …}: what stands around it is checked as well
     around = {fold(key): key for key in entries if key != name}
     unknown.check((around[key] for key in LEFT.unknown(around)), Keys(()), path)
-    return own
+    return entries_of_camera
 
 
-def camera_of(path: str | Path, found: Found, id: str) -> Camera:
+def camera_of(path: str | Path, by_meaning: Found, id: str) -> Camera:
     """The camera of the entries by meaning.
 
     **Raises:** `InputError` naming the entry.
     """
-    core, skew = _core(path, found)
-    mirror = _mirror(path, found)
-    fisheye = not mirror and _is_fisheye(path, found)
-    values = _coefficients(path, found, fisheye)
+    core, skew = _core(path, by_meaning)
+    mirror = _mirror(path, by_meaning)
+    fisheye = not mirror and _is_fisheye(path, by_meaning)
+    values = _coefficients(path, by_meaning, fisheye)
     coefficients, tilt = values[: len(ORDER)], values[len(ORDER) :]
     short = "a fisheye" if fisheye else "an omnidirectional camera" if mirror else ""
     if short and (any(coefficients[4:]) or any(tilt)):
         raise InputError(f"{path}: {len(values)} distortion coefficients; {short} has 4")
-    size = _image_size(path, found)
-    core, size, told = _published_image(path, found, core, size)
+    size = _image_size(path, by_meaning)
+    core, size, messages = _published_image(path, by_meaning, core, size)
     names = ORDER if not fisheye else ("k1", "k2", "k3", "k4")
     camera = Camera(
         id=id,
@@ -217,17 +217,17 @@ def camera_of(path: str | Path, found: Found, id: str) -> Camera:
     check_camera(camera, f"{path}, ")
     if skew or any(tilt):
         camera = _fit(Path(path), camera, skew, tilt)
-    return with_messages(camera, *told)
+    return with_messages(camera, *messages)
 
 
-def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
+def _core(path: str | Path, by_meaning: Found) -> tuple[dict[str, float], float]:
     """fx, fy, cx, cy and the skew."""
-    extra = _number(path, found, "skew", 0.0)
-    if "camera_matrix" not in found and {"fx", "fy"} <= found.keys():
-        return {name: _number(path, found, name) for name in CORE}, extra
-    if "camera_matrix" not in found:
+    extra = _number(path, by_meaning, "skew", 0.0)
+    if "camera_matrix" not in by_meaning and {"fx", "fy"} <= by_meaning.keys():
+        return {name: _number(path, by_meaning, name) for name in CORE}, extra
+    if "camera_matrix" not in by_meaning:
         raise InputError(f"{path}: camera_matrix is missing")
-    name, value = found["camera_matrix"]
+    name, value = by_meaning["camera_matrix"]
     # As Kalibr and ROS write `intrinsics`.
     if "intrinsic" in name.lower() and isinstance(value, list) and len(value) == 4:
         four = matrix_of(path, name, value, None).tolist()
@@ -242,74 +242,77 @@ def _core(path: str | Path, found: Found) -> tuple[dict[str, float], float]:
                 "expected rows (fx, s, cx), (0, fy, cy), (0, 0, 1), with 1 less in cx and cy"
             )
         K = K.T
-    for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
-        if K[row, column] != wanted:
+    for row, column, expected in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
+        if K[row, column] != expected:
             raise InputError(
-                f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; expected {wanted}"
+                f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; expected {expected}"
             )
     core: dict[str, float] = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
     for key in CORE:
         # Programs that write both round one of them.
-        if key in found and abs(_number(path, found, key) - core[key]) > 1e-3:
+        if key in by_meaning and abs(_number(path, by_meaning, key) - core[key]) > 1e-3:
             raise InputError(
-                f"{path}: {found[key][0]} is {found[key][1]:g}, but {name} has {core[key]:g}; "
+                f"{path}: {by_meaning[key][0]} is {by_meaning[key][1]:g}, but {name} has "
+                f"{core[key]:g}; "
                 "expected equal numbers"
             )
     if K[0, 1] and extra and K[0, 1] != extra:
-        raise InputError(f"{path}: {found['skew'][0]} and {name}[0][1] differ; expected one skew")
+        raise InputError(
+            f"{path}: {by_meaning['skew'][0]} and {name}[0][1] differ; expected one skew"
+        )
     return core, float(K[0, 1]) or extra
 
 
-def _mirror(path: str | Path, found: Found) -> dict[str, float]:
+def _mirror(path: str | Path, by_meaning: Found) -> dict[str, float]:
     """ξ of an omnidirectional camera; nothing of others.
 
     **Raises:** `InputError` for a lens model that is another."""
-    if "xi" not in found:
+    if "xi" not in by_meaning:
         return {}
     for meaning in MODEL_KEYS:
-        key, kind = found.get(meaning, ("", ""))
+        key, kind = by_meaning.get(meaning, ("", ""))
         folded = fold(str(kind))
         if folded and not OMNIDIRECTIONAL.search(folded) and MODEL_NAMES.get(folded) != "opencv":
             raise InputError(
                 f"{path}: {key} {show(kind)} with xi is not known here; expected OpenCV's "
                 "omnidirectional camera"
             )
-    name, value = found["xi"]
+    name, value = by_meaning["xi"]
     values = [value] if _is_number(value) else matrix_of(path, name, value, None).tolist()
     if len(values) != 1:
         raise InputError(f"{path}: {name} has {len(values)} values; expected a finite number")
     return {"xi": float(values[0])}
 
 
-def _number(path: str | Path, found: Found, kind: str, default: float | None = None) -> float:
-    if kind not in found and default is not None:
+def _number(path: str | Path, by_meaning: Found, kind: str, default: float | None = None) -> float:
+    if kind not in by_meaning and default is not None:
         return default
-    if kind not in found:
+    if kind not in by_meaning:
         raise InputError(f"{path}: {kind} is missing")
-    name, value = found[kind]
+    name, value = by_meaning[kind]
     if not _is_number(value):
         raise InputError(f"{path}: {name} is {show(value)}; expected a finite number")
     return float(value)
 
 
-def _is_fisheye(path: str | Path, found: Found) -> bool:
+def _is_fisheye(path: str | Path, by_meaning: Found) -> bool:
     """Whether the model is that of `cv2.fisheye`.
 
     **Raises:** `InputError` for a lens model that is not OpenCV's."""
-    _, flag = found.get("fisheye_model", ("", False))
+    _, flag = by_meaning.get("fisheye_model", ("", False))
     if isinstance(flag, str):
         flag = flag.strip().lower() in ("1", "true", "yes")
     models = [flag is True or (_is_number(flag) and flag == 1)]
     for meaning in MODEL_KEYS:
-        key, kind = found.get(meaning, ("", ""))
+        key, kind = by_meaning.get(meaning, ("", ""))
         if not kind:
             continue
         folded = fold(str(kind))
         model = MODEL_NAMES.get(folded)
         foreign = model is None and FOREIGN_MODELS.search(folded)
         # `model` may be a product's name; without any distortion all models are the same
-        named = model is None and meaning == "distortion_model"
-        if foreign or (named and not _all_zero(path, found)):
+        is_model_name = model is None and meaning == "distortion_model"
+        if foreign or (is_model_name and not _all_zero(path, by_meaning)):
             raise InputError(
                 f"{path}: {key} {show(kind)} is not known here; expected plumb_bob, "
                 "rational_polynomial (OpenCV's), equidistant or fisheye"
@@ -318,25 +321,27 @@ def _is_fisheye(path: str | Path, found: Found) -> bool:
     return any(models)
 
 
-def _all_zero(path: str | Path, found: Found) -> bool:
+def _all_zero(path: str | Path, by_meaning: Found) -> bool:
     """Whether coefficients are given and are all 0."""
-    given = not found.keys().isdisjoint(("distortion_coefficients", *ORDER, *TILT))
-    return given and not any(_coefficients(path, found, False))
+    are_given = not by_meaning.keys().isdisjoint(("distortion_coefficients", *ORDER, *TILT))
+    return are_given and not any(_coefficients(path, by_meaning, False))
 
 
-def _coefficients(path: str | Path, found: Found, fisheye: bool) -> list[float]:
+def _coefficients(path: str | Path, by_meaning: Found, fisheye: bool) -> list[float]:
     """The coefficients in OpenCV's order."""
-    named = {name: _number(path, found, name) for name in (*ORDER, *TILT) if name in found}
-    if "distortion_coefficients" not in found:
+    by_name = {
+        name: _number(path, by_meaning, name) for name in (*ORDER, *TILT) if name in by_meaning
+    }
+    if "distortion_coefficients" not in by_meaning:
         order = ("k1", "k2", "k3", "k4") if fisheye else (*ORDER, *TILT)
-        other = [name for name, value in named.items() if value and name not in order]
-        if other:
-            raise InputError(f"{path}: {', '.join(other)}: a fisheye has k1 to k4")
-        return [named.get(name, 0.0) for name in order]
-    name, value = found["distortion_coefficients"]
+        unused = [name for name, value in by_name.items() if value and name not in order]
+        if unused:
+            raise InputError(f"{path}: {', '.join(unused)}: a fisheye has k1 to k4")
+        return [by_name.get(name, 0.0) for name in order]
+    name, value = by_meaning["distortion_coefficients"]
     values = matrix_of(path, name, value, None).tolist()
-    if any(named.values()) and [named.get(k, 0.0) for k in ORDER[: len(values)]] != values:
-        raise InputError(f"{path}: {name} and {', '.join(named)} differ; expected one of them")
+    if any(by_name.values()) and [by_name.get(k, 0.0) for k in ORDER[: len(values)]] != values:
+        raise InputError(f"{path}: {name} and {', '.join(by_name)} differ; expected one of them")
     # Programs pad with zeros: [k1, k2, p1, p2, k3, 0] is a vector of five.
     while values and len(values) not in COEFFICIENT_COUNTS and values[-1] == 0:
         values = values[:-1]
@@ -346,26 +351,26 @@ def _coefficients(path: str | Path, found: Found, fisheye: bool) -> list[float]:
     return values
 
 
-def _image_size(path: str | Path, found: Found) -> tuple[int, int] | None:
-    sides = [found.get(f"image_{n}", ("", None))[1] for n in ("width", "height")]
+def _image_size(path: str | Path, by_meaning: Found) -> tuple[int, int] | None:
+    sides = [by_meaning.get(f"image_{n}", ("", None))[1] for n in ("width", "height")]
     if sides == [None, None]:
-        size = found.get("image_size", ("", None))[1]
+        size = by_meaning.get("image_size", ("", None))[1]
         if size is None:
             return None
         if isinstance(size, Mapping):
-            own = {MEANING.get(fold(name)): value for name, value in size.items()}
-            size = [own.get("image_width"), own.get("image_height")]
-            size = found["image_size"][1]["data"] if size == [None, None] else size
+            by_own_name = {MEANING.get(fold(name)): value for name, value in size.items()}
+            size = [by_own_name.get("image_width"), by_own_name.get("image_height")]
+            size = by_meaning["image_size"][1]["data"] if size == [None, None] else size
         size = size[0] if isinstance(size, list) and len(size) == 1 else size
         sides = size if isinstance(size, list) and len(size) == 2 else [None, None]
-    width, height = (_whole(x) for x in sides)
+    width, height = (_as_whole_number(x) for x in sides)
     if width is None or height is None:
         raise InputError(f"{path}: the image size is {show(sides)}; two whole numbers expected")
     return width, height
 
 
 def _published_image(
-    path: str | Path, found: Found, core: dict[str, float], size: tuple[int, int] | None
+    path: str | Path, by_meaning: Found, core: dict[str, float], size: tuple[int, int] | None
 ) -> tuple[dict[str, float], tuple[int, int] | None, list[str]]:
     """The camera of the image that a camera of ROS publishes: a region of the whole one (`roi`),
     whose pixels are binned.
@@ -374,7 +379,7 @@ def _published_image(
 
     Source: ROS, sensor_msgs/CameraInfo; image_geometry, PinholeCameraModel::fromCameraInfo.
     """
-    name, roi = found.get("roi", ("", {}))
+    name, roi = by_meaning.get("roi", ("", {}))
     whole = {}
     for key, value in roi.items():
         if fold(key) in ("dorectify",):
@@ -385,11 +390,11 @@ def _published_image(
             whole[fold(key)] = _count(path, f"{name}: {key}", value)
     x, y = whole.get("xoffset", 0), whole.get("yoffset", 0)
     bins = [
-        _count(path, *found[kind]) or 1 if kind in found else 1
+        _count(path, *by_meaning[kind]) or 1 if kind in by_meaning else 1
         for kind in ("binning_x", "binning_y")
     ]
     region = [whole.get(key, 0) for key in ("width", "height")]
-    told = []
+    messages = []
     if size is None and any((x, y, *region)):
         raise InputError(f"{path}: {name} needs the size of the whole image, which is missing")
     if size is not None:
@@ -400,9 +405,9 @@ def _published_image(
                 f"image of {size[0]} × {size[1]} px"
             )
         if (x, y, *region, *bins) == (0, 0, *size, 1, 1):
-            return core, size, told
+            return core, size, messages
         size = region[0] // bins[0], region[1] // bins[1]
-        told = [
+        messages = [
             f"{path}: roi and binning are applied: the camera is that of the published image, "
             f"{size[0]} × {size[1]} px"
         ]
@@ -412,13 +417,13 @@ def _published_image(
         "cx": (core["cx"] - x) / bins[0],
         "cy": (core["cy"] - y) / bins[1],
     }
-    return core, size, told
+    return core, size, messages
 
 
 def _count(path: str | Path, name: str, value: object) -> int:
     if value == 0:
         return 0
-    number = _whole(value)
+    number = _as_whole_number(value)
     if number is None:
         raise InputError(f"{path}: {name} is {show(value)}; expected a whole number")
     return number
@@ -447,13 +452,13 @@ def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> Fitt
 
 def _image(name: str, p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """Pixels of a ray in a camera with a skew and a tilted sensor."""
-    model, own = get_model(name), p["camera"]
+    model, camera_parameters = get_model(name), p["camera"]
     # The homography acts on [x'', y''] before fx, fy, cx, cy do: the model is asked without them.
-    plain = own | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    plain = camera_parameters | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
     xy = project(model, tuple(plain[key] for key in model.parameters), X, -Y, -Z)
     x, y, s = p["H"] @ jnp.stack([*xy, 1.0])
-    u = own["fx"] * x / s + p["skew"] * y / s + own["cx"]
-    return jnp.stack([u, own["fy"] * y / s + own["cy"]])
+    u = camera_parameters["fx"] * x / s + p["skew"] * y / s + camera_parameters["cx"]
+    return jnp.stack([u, camera_parameters["fy"] * y / s + camera_parameters["cy"]])
 
 
 FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt", "mei")}
@@ -474,32 +479,38 @@ def matrix_of(
 
     **Raises:** `InputError` naming file and entry."""
     if isinstance(value, Mapping):
-        stated = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
+        stated_shape = tuple(_as_whole_number(value.get(key)) for key in ("rows", "cols"))
         data = value.get("data")
         # ROS writes a camera without distortion as 1 × 0 numbers, or none at all
         if data in (None, []) and 0 in (value.get("rows"), value.get("cols")):
-            data, stated = [], (1, 0)
-        whole = [n for n in stated if n is not None]
-        if len(whole) < 2 or not isinstance(data, list) or len(data) != whole[0] * whole[1]:
+            data, stated_shape = [], (1, 0)
+        whole_numbers = [n for n in stated_shape if n is not None]
+        if (
+            len(whole_numbers) < 2
+            or not isinstance(data, list)
+            or len(data) != whole_numbers[0] * whole_numbers[1]
+        ):
             size = len(data) if isinstance(data, list) else "no"
             raise InputError(
                 f"{path}: {name} has {size} numbers for {show(value.get('rows'))} rows and "
                 f"{show(value.get('cols'))} columns"
             )
     else:
-        data, stated = value, None
+        data, stated_shape = value, None
         # [[…]], [[[…]]]: rows of a matrix, and of lists of lists of one
         while isinstance(data, list) and data and all(isinstance(row, list) for row in data):
             data = [x for row in data for x in row]
     if not isinstance(data, list) or not all(_is_number(x) for x in data):
         raise InputError(f"{path}: {name}: expected a list of finite numbers")
-    if shape is not None and (stated not in (None, shape) or len(data) != shape[0] * shape[1]):
+    if shape is not None and (
+        stated_shape not in (None, shape) or len(data) != shape[0] * shape[1]
+    ):
         raise InputError(f"{path}: {name} must have {shape[0]} rows and {shape[1]} columns")
     array = np.array(data, float)
     return array if shape is None else array.reshape(shape)
 
 
-def _whole(value: object) -> int | None:
+def _as_whole_number(value: object) -> int | None:
     if not _is_number(value) or not float(value).is_integer() or not 0 < value < 1e9:
         return None
     return int(value)

@@ -55,8 +55,8 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
     except ValueError as error:
         raise InputError(f"{path}: not a result in JSON: {str(error)[:100]}") from None
     except (KeyError, TypeError, AttributeError) as error:
-        what = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
-        raise InputError(f"{path}: not the result of adjust or calibrate: {what}") from None
+        fault = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{path}: not the result of adjust or calibrate: {fault}") from None
 
 
 def _calibrate(
@@ -73,11 +73,11 @@ def _calibrate(
     # Both or none: σ and correlations of one covariance.
     kind = "_correlated" if "correlations_correlated" in entry else ""
     sigma = np.array([float(parameters[name][f"sigma{kind}"]) for name in free])
-    known = entry[f"correlations{kind}"]
+    correlations = entry[f"correlations{kind}"]
     # The JSON has one row for a group of tied parameters: they are fully correlated, ρ = 1.
-    listed = {name: _find_tied(name, parameters, known) for name in free}
-    correlation = lambda a, b: 1.0 if a == b else float(known[a][b])
-    R = np.array([[correlation(listed[a], listed[b]) for b in free] for a in free])
+    name_listed = {name: _find_tied(name, parameters, correlations) for name in free}
+    correlation = lambda a, b: 1.0 if a == b else float(correlations[a][b])
+    R = np.array([[correlation(name_listed[a], name_listed[b]) for b in free] for a in free])
     R = R.reshape(len(free), len(free))  # without free parameters [0, 0]
     if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
         raise InputError(f"{path}, camera {id!r}: a σ or correlation is not a number")
@@ -85,13 +85,13 @@ def _calibrate(
 
 
 def _find_tied(
-    name: str, parameters: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]
+    name: str, parameters: Mapping[str, Mapping[str, Any]], correlations: Mapping[str, Any]
 ) -> str:
     """The parameter with the correlations of this one: itself, or the first of tied ones, such as
     fx and fy, with the same value and σ."""
-    if name in known:
+    if name in correlations:
         return name
-    same = lambda other: all(
-        parameters[other][what] == parameters[name][what] for what in ("value", "sigma")
+    is_same = lambda other: all(
+        parameters[other][field] == parameters[name][field] for field in ("value", "sigma")
     )
-    return next((other for other in known if same(other)), name)
+    return next((other for other in correlations if is_same(other)), name)

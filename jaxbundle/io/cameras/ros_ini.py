@@ -89,16 +89,16 @@ def read_ros_sections(path: Path) -> list[tuple[Camera, Section]]:
                 size[f"image_{key}"] = key, values[0]
             continue
         unknown.check(section, KEYS, f"{path}, [{name}]")
-        found: Found = dict(size)
+        by_meaning: Found = dict(size)
         for key, kind in zip(KEYS.used, ("camera_matrix", "distortion_coefficients")):
             if key not in section:
                 raise InputError(f"{path}, [{name}]: {key} is missing; expected it in a camera")
-            found[kind] = key, section[key]
-        cameras[name] = camera_of(f"{path}, [{name}]", found, name), section
+            by_meaning[kind] = key, section[key]
+        cameras[name] = camera_of(f"{path}, [{name}]", by_meaning, name), section
     if not cameras:
         raise InputError(f"{path}: there is no camera in it; expected a section [NAME]")
-    told = unknown.messages()
-    return [(with_messages(camera, *told), section) for camera, section in cameras.values()]
+    messages = unknown.messages()
+    return [(with_messages(camera, *messages), section) for camera, section in cameras.values()]
 
 
 def _sections(path: Path) -> Iterator[tuple[str, Section]]:

@@ -203,8 +203,8 @@ def camodocal_camera(path: Path, fields: JsonFields) -> Camera:
     unknown.check(fields.document, CAMODOCAL_KEYS, path)
     for section in (PROJECTION, DISTORTION, MIRROR):
         if fields.get(section) is not None:
-            own = [key.partition(".")[2] for key in lens.keys.values() if section in key]
-            unknown.check(fields.child(section).document, Keys(own), f"{path}, {section}")
+            lens_keys = [key.partition(".")[2] for key in lens.keys.values() if section in key]
+            unknown.check(fields.child(section).document, Keys(lens_keys), f"{path}, {section}")
     parameters = {name: fields.number(key) for name, key in lens.required.items()}
     parameters |= {name: fields.number(key, 0.0) for name, key in lens.optional.items()}
     return _named_camera(path, fields, lens.model, parameters, unknown)
@@ -247,10 +247,10 @@ def _scaramuzza(path: Path, fields: JsonFields) -> Camera:
 def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Camera]:
     """One camera of ORB-SLAM or two."""
     document = fields.document
-    given = [str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)]
+    types_given = [str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)]
     # Some files have the arrangement of the cameras as their type, and the lens as their model.
-    lenses = [text for text in given if text.lower() not in ARRANGEMENTS]
-    text = next(iter(lenses or given), "")
+    lenses = [text for text in types_given if text.lower() not in ARRANGEMENTS]
+    text = next(iter(lenses or types_given), "")
     kind = re.sub(r"[\W_]+", "", text).lower() or "pinhole"
     if document.get("Camera.bFishEye") and ORB_SLAM.get(kind, ("",))[0] != "kannala-brandt":
         raise InputError(f"{path}: Camera.bFishEye of ORB-SLAM without Camera.type KannalaBrandt8")
@@ -263,8 +263,8 @@ def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Ca
     prefixes = [p for p in (*PREFIXES, "Camera2") if f"{p}.fx" in document]
     if "Camera" in prefixes and "Camera1" in prefixes:
         raise InputError(f"{path}: Camera.fx and Camera1.fx; expected one of them")
-    own = [f"{p}.{name}" for p in prefixes for name in f"{CORE} {names}".split()]
-    unknown.check(document, ORB_KEYS | Keys(own), path)
+    orb_keys = [f"{p}.{name}" for p in prefixes for name in f"{CORE} {names}".split()]
+    unknown.check(document, ORB_KEYS | Keys(orb_keys), path)
     # A dot leads into an object; these keys have dots themselves.
     raw = JsonFields(path, {key.replace(".", " "): value for key, value in document.items()})
     sides = [("Camera width", "Camera height"), ("Camera cols", "Camera rows")]

@@ -138,14 +138,14 @@ def meaning_of(name: str, value: Any) -> str | None:
 
 
 def camera_entries(
-    entries: Mapping[str, Any], where: object, unknown: UnknownKeys, left: Keys = LEFT
+    entries: Mapping[str, Any], where: object, unknown: UnknownKeys, ignored: Keys = LEFT
 ) -> Found:
     """The entries of a camera by meaning; others are checked by the rule of keys.
 
     **Raises:** `InputError` for an unknown entry that may change the geometry, and for two entries
     of one meaning."""
-    found: Found = {}
-    rest = []
+    by_meaning: Found = {}
+    other_names = []
     for name, value in entries.items():
         kind = meaning_of(name, value)
         # What is null, or an empty list, says nothing.
@@ -154,46 +154,48 @@ def camera_entries(
         if kind == "distortion_coefficients" and isinstance(value, str):
             kind = "distortion_model"
         if kind is None:
-            rest.append(name)
+            other_names.append(name)
         elif kind in ("camera_matrix", "distortion_coefficients") and _is_named(value):
-            own = camera_entries(value, where, unknown, left)
-            if kind == "distortion_coefficients" and own.keys().isdisjoint(
+            nested = camera_entries(value, where, unknown, ignored)
+            if kind == "distortion_coefficients" and nested.keys().isdisjoint(
                 (kind, *COEFFICIENTS, *TILT)
             ):
                 raise InputError(
                     f"{where}: {name} is {show(value)}; expected the coefficients of distortion"
                 )
-            for meaning, (spelled, part) in own.items():
-                _put(found, meaning, (f"{name}.{spelled}", part), where)
+            for meaning, (spelled, part) in nested.items():
+                _add_entry(by_meaning, meaning, (f"{name}.{spelled}", part), where)
         else:
-            _put(found, kind, (name, value), where)
-    if "roi" in found and not isinstance(found["roi"][1], Mapping):
+            _add_entry(by_meaning, kind, (name, value), where)
+    if "roi" in by_meaning and not isinstance(by_meaning["roi"][1], Mapping):
         # OpenCV's getOptimalNewCameraMatrix gives both, of the undistorted image
         if not any("new" in fold(name) or "optimal" in fold(name) for name in entries):
             raise InputError(
-                f"{where}: {found['roi'][0]} is {show(found['roi'][1])}; expected x_offset, "
+                f"{where}: {by_meaning['roi'][0]} is {show(by_meaning['roi'][1])}; expected "
+                "x_offset, "
                 "y_offset, width and height, as in ROS; without it if the image is whole"
             )
-        del found["roi"]
-    folded = {fold(name): name for name in rest}
-    if "xi" in found and (sphere := [name for key, name in folded.items() if key == "alpha"]):
+        del by_meaning["roi"]
+    folded = {fold(name): name for name in other_names}
+    if "xi" in by_meaning and (sphere := [name for key, name in folded.items() if key == "alpha"]):
         raise InputError(
-            f"{where}: {found['xi'][0]} and {sphere[0]} are a double sphere, not a camera of "
+            f"{where}: {by_meaning['xi'][0]} and {sphere[0]} are a double sphere, not a camera of "
             "OpenCV; expected a Kalibr file, camera_model ds"
         )
-    for name in left.unknown(folded):
+    for name in ignored.unknown(folded):
         unknown.check([folded[name]], Keys((*CORE, *SPELLINGS)), where)
-    return found
+    return by_meaning
 
 
-def _put(found: Found, kind: str, entry: tuple[str, Any], where: object) -> None:
+def _add_entry(by_meaning: Found, kind: str, entry: tuple[str, Any], where: object) -> None:
     # Of several names, the first: none of them concerns rays.
-    if kind != "camera_name" and kind in found and found[kind][1] != entry[1]:
+    if kind != "camera_name" and kind in by_meaning and by_meaning[kind][1] != entry[1]:
         raise InputError(
-            f"{where}: {found[kind][0]} and {entry[0]} are both the {kind.replace('_', ' ')}, and "
+            f"{where}: {by_meaning[kind][0]} and {entry[0]} are both the "
+            f"{kind.replace('_', ' ')}, and "
             "differ; expected one of them"
         )
-    found.setdefault(kind, entry)
+    by_meaning.setdefault(kind, entry)
 
 
 def _is_named(value: Any) -> TypeGuard[Mapping[str, Any]]:
@@ -208,8 +210,8 @@ def _is_scalar(value: Any) -> bool:
 def is_matrix(value: Any) -> bool:
     """Whether a value may be the matrix of a camera, or its numbers by name."""
     if isinstance(value, Mapping):
-        named = {MEANING.get(fold(name)) for name in value}
-        return {"rows", "data"} <= value.keys() or {"fx", "fy"} <= named
+        meanings = {MEANING.get(fold(name)) for name in value}
+        return {"rows", "data"} <= value.keys() or {"fx", "fy"} <= meanings
     flat = _flat(value)
     return len(flat) in (4, 9) and all(map(_is_scalar, flat))
 
@@ -226,8 +228,8 @@ def has_camera(entries: Any) -> bool:
     if not isinstance(entries, Mapping):
         return False
     kinds = {meaning_of(name, value): value for name, value in entries.items()}
-    named = {"fx", "fy"} <= kinds.keys()
-    return named or is_matrix(kinds.get("camera_matrix"))
+    has_lengths = {"fx", "fy"} <= kinds.keys()
+    return has_lengths or is_matrix(kinds.get("camera_matrix"))
 
 
 def cameras_within(

@@ -138,10 +138,10 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         if row.text("intrinsicId", "none") in cameras:
             views[row.text("viewId")] = row
     tie, colours, rays = _structure(file, unknown, views)
-    seen = {view for view, *_ in rays}
+    seen_views = {view for view, *_ in rays}
     posed = {id for id, row in views.items() if row.text("poseId", "none") in poses}
-    left = [Path(_path(views[id], id)).name for id in views if id not in posed | seen]
-    views = {id: row for id, row in views.items() if id in posed | seen}
+    left_out = [Path(_path(views[id], id)).name for id in views if id not in posed | seen_views]
+    views = {id: row for id, row in views.items() if id in posed | seen_views}
     if not views:
         raise InputError(
             f"{path}: a scene of AliceVision without poses and image points; expected the result "
@@ -170,7 +170,10 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
     rgb = stack_rows([_plain(value) for value in colours], 3, place).reshape(-1, 3)
     place = lambda k: (f"{path}, landmark {rays[k][1]}, view {rays[k][0]}", "x")
     xy = stack_rows([_plain(x) for *_, x in rays], 2, place).reshape(-1, 2)
-    told = [f"left out {count(len(left), 'view')} without pose and image points: {list_some(left)}"]
+    messages = [
+        f"left out {count(len(left_out), 'view')} without pose and image points: "
+        f"{list_some(left_out)}"
+    ]
     return assemble(
         path,
         foreign_document(path.stem, cameras.values()),
@@ -188,7 +191,7 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
             },
             Source(str(path), None, "observation"),
         ),
-        (*(told if left else ()), *unknown.messages()),
+        (*(messages if left_out else ()), *unknown.messages()),
     )
 
 

@@ -46,10 +46,12 @@ def write_alicevision(network: Network, path: str | Path) -> tuple[str, ...]:
         # By columns.
         transform = {"rotation": _texts(R[i].T.ravel()), "center": _texts(images.position[i])}
         poses.append({"poseId": str(i), "pose": {"transform": transform | {"locked": "0"}}})
-    seen: list[list[dict]] = [[] for _ in points.id]
+    observations_of_point: list[list[dict]] = [[] for _ in points.id]
     features = np.zeros(len(images), int)
     for i, p, xy in zip(rays.image.tolist(), rays.point.tolist(), rays.xy):
-        seen[p].append({"observationId": str(i), "featureId": str(features[i]), "x": _texts(xy)})
+        observations_of_point[p].append(
+            {"observationId": str(i), "featureId": str(features[i]), "x": _texts(xy)}
+        )
         features[i] += 1
     # A landmark without a colour is grey, as the program has it.
     colours = points.colour_or_grey().tolist()
@@ -61,7 +63,9 @@ def write_alicevision(network: Network, path: str | Path) -> tuple[str, ...]:
             "X": _texts(X),
             "observations": observations,
         }
-        for number, colour, X, observations in zip(landmarks, colours, points.position, seen)
+        for number, colour, X, observations in zip(
+            landmarks, colours, points.position, observations_of_point
+        )
     ]
     scene = {
         "version": list(VERSION),

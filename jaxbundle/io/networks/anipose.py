@@ -82,13 +82,14 @@ def read_anipose(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if not tables:
         raise InputError(f"{path}: there is no camera; expected [cam_0] with matrix, …")
     fields = [JsonFields(f"{path}, [{key}]", table) for key, table in tables.items()]
-    for one in fields:
-        unknown.check(one.document, KEYS, one.path)
-    names = [one.text("name", key) for one, key in zip(fields, tables)]
+    for camera_fields in fields:
+        unknown.check(camera_fields.document, KEYS, camera_fields.path)
+    names = [camera_fields.text("name", key) for camera_fields, key in zip(fields, tables)]
     cameras = [
-        _camera(id, one) for id, one in zip(unique_labels(names, [*tables]), fields, strict=True)
+        _camera(id, camera_fields)
+        for id, camera_fields in zip(unique_labels(names, [*tables]), fields, strict=True)
     ]
-    poses = [_pose(one) for one in fields]
+    poses = [_pose(camera_fields) for camera_fields in fields]
     R, t = zip(*poses)
     return rig_network(path, cameras, R, t, overrides, unknown.messages())
 
@@ -112,14 +113,14 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         expected = "4" if fisheye else "none, 4, 5 or 8"
         raise InputError(f"{fields.path}: distortions has {number} numbers; expected {expected}")
     values = fields.array("distortions", (number,)) if number else np.zeros(0)
-    named = dict(zip(EQUI if fisheye else OPENCV, values.tolist()))
+    distortion = dict(zip(EQUI if fisheye else OPENCV, values.tolist()))
     core = dict(zip(CORE, (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
     w, h = fields.array("size", (2,))
     size = JsonFields(f"{fields.path}: size", {"w": w, "h": h})
     return Camera(
         id,
         "kannala-brandt" if fisheye else "opencv",
-        {name: float(value) for name, value in (core | named).items()},
+        {name: float(value) for name, value in (core | distortion).items()},
         image_size=(size.integer("w", least=1), size.integer("h", least=1)),
     )
 
@@ -139,9 +140,9 @@ def write_anipose(network: Network, path: str | Path) -> tuple[str, ...]:
 
     **Raises:** `InputError` for a camera of another model, or without image size.
     """
-    mountings, lost = mountings_of(network), []
+    mountings, losses = mountings_of(network), []
     if mountings is None and len(network.cameras) > 1:
-        lost.append("mountings of the cameras")
+        losses.append("mountings of the cameras")
     document, place = {}, np.eye(4)
     for k, camera in enumerate(network.cameras):
         if mountings is not None and k:
@@ -152,7 +153,7 @@ def write_anipose(network: Network, path: str | Path) -> tuple[str, ...]:
             section["translation"] = place[:3, 3].tolist()
         document[f"cam_{k}"] = section
     write_text(Path(path), toml_text(document | {"metadata": {"adjusted": True}}))
-    return (*describe_losses(network, ANIPOSE_LOSSES), *lost)
+    return (*describe_losses(network, ANIPOSE_LOSSES), *losses)
 
 
 def _camera_section(camera: Camera) -> dict[str, Any]:

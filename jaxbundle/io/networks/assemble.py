@@ -104,7 +104,7 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
     check_unique(ids, images.source, "image")
     index = {camera.id: c for c, camera in enumerate(cameras)}
     exterior = np.stack([images.numbers(name) for name in EXTERIOR], 1)
-    none = np.zeros(0, np.int64)
+    no_rows = np.zeros(0, np.int64)
     # These settings concern observations and points, of which there are none.
     unused = ("sigma_image", "sigma_origin", "datum_points")
     settings = {k: v for k, v in project.items() if k not in unused}
@@ -119,7 +119,7 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
             images.source,
         ),
         points=Points((), (), np.zeros((0, 3)), np.zeros((0, 3))),
-        observations=Observations(none, none, np.zeros((0, 2)), np.zeros((0, 2))),
+        observations=Observations(no_rows, no_rows, np.zeros((0, 2)), np.zeros((0, 2))),
         **settings,
     )
 
@@ -152,15 +152,20 @@ def rig_network(
     """
     names = [camera.id for camera in cameras]
     M, X0 = exterior_from_cv(np.stack(R), np.stack(t))
-    known = np.asarray(np.isfinite(np.concatenate([X0, M.reshape(-1, 9)], 1)).all(axis=1))
-    if known.sum() < 2 and len(names) > 1:
+    is_placed = np.asarray(np.isfinite(np.concatenate([X0, M.reshape(-1, 9)], 1)).all(axis=1))
+    if is_placed.sum() < 2 and len(names) > 1:
         # A pose relative to nothing.
-        known[:] = False
-    M[~known], X0[~known] = np.nan, np.nan
-    apart = [name for name, there in zip(names, known) if not there]
-    if apart and len(names) > 1:
-        what = f"{count(len(apart), 'camera')} without a pose relative to another in the file"
-        warnings = (*warnings, f"{path}: {what}, left without orientation: {list_some(apart)}")
+        is_placed[:] = False
+    M[~is_placed], X0[~is_placed] = np.nan, np.nan
+    unplaced = [name for name, is_there in zip(names, is_placed) if not is_there]
+    if unplaced and len(names) > 1:
+        description = (
+            f"{count(len(unplaced), 'camera')} without a pose relative to another in the file"
+        )
+        warnings = (
+            *warnings,
+            f"{path}: {description}, left without orientation: {list_some(unplaced)}",
+        )
     source = Source(str(path), None, "camera")
     network = assemble(
         path,
@@ -169,10 +174,14 @@ def rig_network(
         image_columns(source, names, names, M, X0),
         warnings=warnings,
     )
-    mounted = [name for name, there in zip(names, known) if there]
-    if len(mounted) < 2:
+    placed_names = [name for name, is_there in zip(names, is_placed) if is_there]
+    if len(placed_names) < 2:
         return network
-    columns = {"rig": [RIG] * len(mounted), "epoch": [MOMENT] * len(mounted), "image": mounted}
+    columns = {
+        "rig": [RIG] * len(placed_names),
+        "epoch": [MOMENT] * len(placed_names),
+        "image": placed_names,
+    }
     return network.replace(further=(Rigs.from_columns(Columns(columns, source), {}, 1.0),))
 
 
@@ -200,7 +209,7 @@ def colour_columns(colours: Num[np.ndarray, "points 3"]) -> dict[str, np.ndarray
     point has one. They take no part in an adjustment: numbers that are no colours are rounded, and
     limited to 0 to 255."""
     colours = np.clip(np.rint(colours), 0, 255)
-    if np.isnan(colours).all() or any((colours == none).all() for none in NO_COLOURS):
+    if np.isnan(colours).all() or any((colours == no_colour).all() for no_colour in NO_COLOURS):
         return {}
     return dict(zip(POINT_COLOURS, colours.T))
 

@@ -70,13 +70,13 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     observed, numbers = np.split(numbers, [4 * rows])
     poses, position = np.split(numbers, [9 * cameras])
     observed, poses = observed.reshape(-1, 4), poses.reshape(-1, 9)
-    for column, count, what in ((0, cameras, "camera"), (1, points, "point")):
+    for column, count, noun in ((0, cameras, "camera"), (1, points, "point")):
         index = observed[:, column]
         wrong = (index < 0) | (index >= count) | (index % 1 != 0)
         if wrong.any():
             row = int(wrong.argmax())
             raise InputError(
-                f"{path}, line {row + 2}: {what} {index[row]:g} does not exist; the first line "
+                f"{path}, line {row + 2}: {noun} {index[row]:g} does not exist; the first line "
                 f"announces {count}, counted from 0"
             )
     camera_entries = [
@@ -171,19 +171,20 @@ def _are_counts(words: Sequence[bytes]) -> bool:
     return len(words) == 3 and all(word.isdigit() for word in words)
 
 
-def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
+def _counts(path: Path, first_words: Sequence[bytes]) -> tuple[int, ...]:
     """The numbers of cameras, points and observations in the first line."""
-    if not _are_counts(first):
+    if not _are_counts(first_words):
         raise InputError(
             f"{path}, line 1: expected three whole numbers: cameras, points, observations"
         )
     # The largest size of a file is 2⁶³ − 1 bytes, a number of 19 digits.
-    if max(map(len, first)) > 18:
+    if max(map(len, first_words)) > 18:
         raise InputError(
-            f"{path}, line 1: {b' '.join(first)[:60].decode()}: more cameras, points, observations "
+            f"{path}, line 1: {b' '.join(first_words)[:60].decode()}: more cameras, points, "
+            "observations "
             "than a file can hold"
         )
-    return tuple(map(int, first))
+    return tuple(map(int, first_words))
 
 
 def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
@@ -198,16 +199,17 @@ def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
             cameras, points, rows = counts
             expected = 4 * rows + 9 * cameras + 3 * points
             size = path.stat().st_size
-            held = largest_unpacked_size(size) if suffix in OPENERS else size
+            unpacked_size = largest_unpacked_size(size) if suffix in OPENERS else size
             # A number of 64 bits has 24 characters at most; 64 leave room for blanks around it.
-            most = min(64 * (expected + 1), held)
-            text = file.read(most + 1)
+            max_bytes = min(64 * (expected + 1), unpacked_size)
+            text = file.read(max_bytes + 1)
     except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
     # A file that goes on is read no further.
-    if len(text) > most:
+    if len(text) > max_bytes:
         raise InputError(
-            f"{path}: holds more than {most} characters, too many for the {expected} numbers that "
+            f"{path}: holds more than {max_bytes} characters, too many for the {expected} numbers "
+            "that "
             f"line 1 announces, in a file of {size} bytes"
         )
     try:
@@ -251,5 +253,5 @@ def _images(pose: Float[np.ndarray, "images 6"]) -> dict[str, np.ndarray]:
 
 def _table(path: Path, word: str, columns: Mapping[str, np.ndarray]) -> Columns:
     """A table with row numbers as ids, from 0."""
-    first = next(iter(columns.values()))
-    return Columns(columns, Source(str(path), np.arange(len(first)), word))
+    first_column = next(iter(columns.values()))
+    return Columns(columns, Source(str(path), np.arange(len(first_column)), word))

@@ -67,18 +67,22 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             raise InputError(f"{folder}: there is no {name} in it")
     photos, rays = _image_coordinates(files[IMAGE])
     cameras, points, skipped = _geo_input(files[GEO])
-    chosen = [_find_camera(*photo, cameras, files[GEO]) for photo in photos]
-    none = np.full(len(photos), np.nan)
+    camera_of_photo = [_find_camera(*photo, cameras, files[GEO]) for photo in photos]
+    unknown = np.full(len(photos), np.nan)
     lines = np.array([row.number for *_, row in photos])
     images = Columns(
-        {"id": [photo for photo, *_ in photos], "camera": chosen, **dict.fromkeys(EXTERIOR, none)},
+        {
+            "id": [photo for photo, *_ in photos],
+            "camera": camera_of_photo,
+            **dict.fromkeys(EXTERIOR, unknown),
+        },
         Source(str(files[IMAGE]), lines, "line"),
     )
     ids = dict.fromkeys(rays.values["point"])
-    known = {row["id"]: row for row in points}
+    known_points = {row["id"]: row for row in points}
     # New points are only in image.dat: tie points, without start values.
-    tie = [{"id": id, "role": "tie"} for id in ids if id not in known]
-    table = [*(row for row in points if row["id"] in ids), *tie]
+    tie_points = [{"id": id, "role": "tie"} for id in ids if id not in known_points]
+    table = [*(row for row in points if row["id"] in ids), *tie_points]
     network = assemble(
         folder,
         foreign_document(
@@ -118,9 +122,9 @@ def _find_camera(
     if camera is None and len(cameras) == 1:
         return next(iter(cameras))
     if camera is None or camera not in cameras:
-        what = f"camera {camera!r}" if camera else "no camera is named, and there are several"
+        subject = f"camera {camera!r}" if camera else "no camera is named, and there are several"
         raise row.error(
-            f"photograph {photo}: {what}; CAPA statements in {file}: {', '.join(cameras)}"
+            f"photograph {photo}: {subject}; CAPA statements in {file}: {', '.join(cameras)}"
         )
     return camera
 

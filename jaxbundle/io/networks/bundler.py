@@ -71,7 +71,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if " ".join(head.words) != HEAD:
         raise head.error(f"expected {HEAD!r}; other versions are not known")
     counts = rows.take("the numbers of cameras and points")
-    cameras, points = (counts.integer(k, what) for k, what in ((0, "cameras"), (1, "points")))
+    cameras, points = (counts.integer(k, noun) for k, noun in ((0, "cameras"), (1, "points")))
     interior, R, t, places = _cameras(rows, cameras)
     oriented = np.flatnonzero(interior[:, 0] != 0) if cameras else np.zeros(0, int)
     if not len(oriented):
@@ -82,11 +82,15 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise rows.take("").error(f"a line after the last of {points} points")
     image = observed[:, 0].astype(np.int64)
     good = np.isin(image, oriented)
-    left = [names[i] for i in np.setdiff1d(np.arange(cameras), oriented)]
-    warnings = [f"left out {count(len(left), 'image')} that have no orientation: {list_some(left)}"]
+    left_out = [names[i] for i in np.setdiff1d(np.arange(cameras), oriented)]
+    warnings = [
+        f"left out {count(len(left_out), 'image')} that have no orientation: {list_some(left_out)}"
+    ]
     M, X0 = exterior_from_bundler(R[oriented], t[oriented])
-    chosen = [names[i] for i in oriented]
-    images = image_columns(Source(str(path), places[oriented], "line"), chosen, chosen, M, X0)
+    oriented_names = [names[i] for i in oriented]
+    images = image_columns(
+        Source(str(path), places[oriented], "line"), oriented_names, oriented_names, M, X0
+    )
     ids = np.arange(points)
     return assemble(
         path,
@@ -112,7 +116,7 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             },
             Source(str(path), observed[good, 4].astype(np.int64), "line"),
         ),
-        warnings if left else (),
+        warnings if left_out else (),
     )
 
 
@@ -127,15 +131,15 @@ def _cameras(
     """f, k1, k2; R; t; and lines, of all cameras."""
     interior, R, t, lines = [], [], [], []
     for k in range(number):
-        thing = f"camera {k} of {number}"
-        row = rows.take(f"f, k1, k2 of {thing}")
+        noun = f"camera {k} of {number}"
+        row = rows.take(f"f, k1, k2 of {noun}")
         interior.append(row.numbers(FREE))
         lines.append(row.number)
-        matrix = [rows.take(f"R of {thing}").numbers(["R"] * 3) for _ in range(3)]
+        matrix = [rows.take(f"R of {noun}").numbers(["R"] * 3) for _ in range(3)]
         R.append(np.array(matrix))
-        t.append(rows.take(f"t of {thing}").numbers(["t"] * 3))
+        t.append(rows.take(f"t of {noun}").numbers(["t"] * 3))
         if interior[-1][0] != 0:  # an image that was not oriented has f = 0 and R = 0
-            check_rotations(R[-1], f"{row.place}: R of {thing}")
+            check_rotations(R[-1], f"{row.place}: R of {noun}")
     return (
         np.array(interior).reshape(-1, 3),
         np.array(R).reshape(-1, 3, 3),
@@ -155,15 +159,19 @@ def _points(
     """Coordinates; colours; lines; and (camera, point, x, y, line) of all rays."""
     position, colours, lines, rays = [], [], [], []
     for k in range(number):
-        thing = f"point {k} of {number}"
-        row = rows.take(f"coordinates of {thing}")
+        noun = f"point {k} of {number}"
+        row = rows.take(f"coordinates of {noun}")
         position.append(row.numbers("XYZ"))
         lines.append(row.number)
-        colours.append(rows.take(f"colour of {thing}").numbers(POINT_COLOURS))
-        row = rows.take(f"rays of {thing}")
+        colours.append(rows.take(f"colour of {noun}").numbers(POINT_COLOURS))
+        row = rows.take(f"rays of {noun}")
         views = row.rays(0, "a ray", cameras, "camera")
-        rest = np.full((len(views), 1), row.number)
-        rays.append(np.concatenate([views[:, :1], np.full_like(rest, k), views[:, 2:], rest], 1))
+        line_numbers = np.full((len(views), 1), row.number)
+        rays.append(
+            np.concatenate(
+                [views[:, :1], np.full_like(line_numbers, k), views[:, 2:], line_numbers], 1
+            )
+        )
     rays = np.concatenate(rays) if rays else np.zeros((0, 5))
     position, colours = (np.array(values).reshape(-1, 3) for values in (position, colours))
     return position, colours, np.array(lines, np.int64), rays

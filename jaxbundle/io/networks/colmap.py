@@ -44,7 +44,7 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and line, or which entry of a binary file.
     """
     path = Path(path)
-    suffix, read = next(
+    suffix, read_model = next(
         (
             (s, r)
             for s, r in ((".bin", read_binary_model), (".txt", read_text_model))
@@ -52,19 +52,21 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ),
         ("", None),
     )
-    if read is None:
+    if read_model is None:
         raise InputError(f"{path}: there is no cameras.bin or cameras.txt in it")
     for part in PARTS:
         if not (path / f"{part}{suffix}").is_file():
             raise InputError(f"{path / part}{suffix}: no such file")
-    model = read(path)
+    model = read_model(path)
     network = to_network(path, model, overrides)
-    there = [part for part in RIGS if (path / f"{part}{suffix}").is_file()]
-    if not there:
+    present_parts = [part for part in RIGS if (path / f"{part}{suffix}").is_file()]
+    if not present_parts:
         return network
-    if len(there) == 1:
-        missing = next(part for part in RIGS if part not in there)
-        raise InputError(f"{path / missing}{suffix}: no such file; expected it beside {there[0]}")
+    if len(present_parts) == 1:
+        missing_part = next(part for part in RIGS if part not in present_parts)
+        raise InputError(
+            f"{path / missing_part}{suffix}: no such file; expected it beside {present_parts[0]}"
+        )
     names = {image.id: image.name for image in model.images}
     return network.replace(further=rigs_of_frames(path, read_frames(path, suffix), names))
 
@@ -75,8 +77,8 @@ def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
     **Raises:** `InputError`.
     """
     path = Path(path)
-    read = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
-    return tuple(read(path).values())
+    read_cameras_of = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
+    return tuple(read_cameras_of(path).values())
 
 
 def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:

@@ -68,18 +68,18 @@ class BinaryFile:
         self.position += size
         return part
 
-    def count(self, what: str, least_size: int) -> int:
+    def count(self, noun: str, least_size: int) -> int:
         """A number of items with at least the given bytes each."""
         (count,) = self.take("Q")
-        left = len(self.data) - self.position
-        if count * least_size > left:
-            raise self.error(f"{count} {what} are announced, but only {left} bytes follow")
+        bytes_left = len(self.data) - self.position
+        if count * least_size > bytes_left:
+            raise self.error(f"{count} {noun} are announced, but only {bytes_left} bytes follow")
         return count
 
-    def numbers(self, n: int, what: str) -> np.ndarray:
+    def numbers(self, n: int, noun: str) -> np.ndarray:
         values = np.frombuffer(self.raw(8 * n), "<f8")
         if not np.isfinite(values).all():
-            raise self.error(f"{what}: {values[~np.isfinite(values)][0]} is not a finite number")
+            raise self.error(f"{noun}: {values[~np.isfinite(values)][0]} is not a finite number")
         return values
 
     def name(self) -> str:
@@ -94,9 +94,11 @@ class BinaryFile:
             raise self.error(f"the name {text[:40]!r} is not UTF-8 text") from None
 
     def end(self) -> None:
-        left = len(self.data) - self.position
-        if left:
-            raise self.error(f"{left} bytes follow the last entry; the counts do not fit the file")
+        bytes_left = len(self.data) - self.position
+        if bytes_left:
+            raise self.error(
+                f"{bytes_left} bytes follow the last entry; the counts do not fit the file"
+            )
 
 
 def read_binary_model(folder: Path) -> ColmapModel:
@@ -136,10 +138,12 @@ def _images(path: Path) -> list[ColmapImage]:
         points = np.frombuffer(file.raw(24 * file.count("image points", 24)), POINT2D)
         if not np.isfinite(points["xy"]).all():
             raise file.error("an image point is not a finite number")
-        none = points["point"] == NO_POINT_ID
-        if (points["point"][~none] >= 2**63).any():
+        has_no_point = points["point"] == NO_POINT_ID
+        if (points["point"][~has_no_point] >= 2**63).any():
             raise file.error("an image point has an impossible object point")
-        point = np.where(none, 0, points["point"]).astype(np.int64) - none  # NO_POINT: −1
+        point = (
+            np.where(has_no_point, 0, points["point"]).astype(np.int64) - has_no_point
+        )  # NO_POINT: −1
         images.append(
             ColmapImage(
                 id,
@@ -193,15 +197,15 @@ def _track_lengths(
     COLMAP writes points by their numbers, and each with its image points: the lengths that follow
     from the images are those of the file if every point has the length expected there.
     """
-    first, size, length = file.position, POINT.itemsize, len(file.data)
+    begin_of_points, size, length = file.position, POINT.itemsize, len(file.data)
     for expected in _expected_lengths(number, images):
-        ends = first + np.cumsum(size + 8 * expected)
+        ends = begin_of_points + np.cumsum(size + 8 * expected)
         if len(expected) == number and ends[-1] == length:
             place = ends - 8 * expected - 8
             data = np.frombuffer(file.data, np.uint8)
             if (data[place[:, None] + np.arange(8)].view("<u8").ravel() == expected).all():
                 return expected
-    rays_of, lengths, begin = struct.Struct("<Q").unpack_from, [], first
+    rays_of, lengths, begin = struct.Struct("<Q").unpack_from, [], begin_of_points
     for k in range(number):
         end = begin + size
         if end > length or (next := end + 8 * rays_of(file.data, end - 8)[0]) > length:
@@ -223,16 +227,16 @@ def _expected_lengths(
     they are numbered from 1."""
     if not number or not images:
         return
-    seen = np.concatenate([image.point for image in images])
-    seen = seen[seen != NO_POINT]
+    seen_points = np.concatenate([image.point for image in images])
+    seen_points = seen_points[seen_points != NO_POINT]
     # Numbers with few gaps, as usual, are counted in a table.
-    if len(seen) and seen.max() < 8 * (len(seen) + number):
-        counts = np.bincount(seen)
+    if len(seen_points) and seen_points.max() < 8 * (len(seen_points) + number):
+        counts = np.bincount(seen_points)
         yield counts[counts > 0]
         if not counts[0] and len(counts) <= number + 1:
             yield np.concatenate([counts[1:], np.zeros(number + 1 - len(counts), counts.dtype)])
     else:
-        yield np.unique(seen, return_counts=True)[1]
+        yield np.unique(seen_points, return_counts=True)[1]
 
 
 def binary_files(model: ColmapModel) -> dict[str, bytes]:

@@ -78,16 +78,16 @@ class ColmapPoints:
 
 
 def check_unique(
-    ids: Sequence[int] | Int[np.ndarray, " rows"], place: Callable[[int], object], thing: str
+    ids: Sequence[int] | Int[np.ndarray, " rows"], place: Callable[[int], object], noun: str
 ) -> None:
     """Refuse repeated numbers; `place(k)` names the position of the k-th."""
     ids = np.asarray(ids)
     if (ids[1:] > ids[:-1]).all():
         return  # in order, as most files are
-    values, first, counts = np.unique(ids, return_index=True, return_counts=True)
+    values, first_rows, counts = np.unique(ids, return_index=True, return_counts=True)
     for value in values[counts > 1][:1]:
-        again = np.flatnonzero(ids == value)[1]
-        raise InputError(f"{place(again)}: {thing} {value} occurs twice")
+        repeated_row = np.flatnonzero(ids == value)[1]
+        raise InputError(f"{place(repeated_row)}: {noun} {value} occurs twice")
 
 
 def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Network:
@@ -139,12 +139,14 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
 
 def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, ...]]:
     """The table of image points; the first if an image has several of one object point."""
-    image = np.repeat(np.arange(len(model.images)), [len(one.point) for one in model.images])
-    point = np.concatenate([one.point for one in model.images])
-    xy = np.concatenate([one.xy for one in model.images]) - PIXEL_CENTRE
-    used = point != NO_POINT
-    if not used.all():
-        image, point, xy = image[used], point[used], xy[used]
+    image = np.repeat(
+        np.arange(len(model.images)), [len(model_image.point) for model_image in model.images]
+    )
+    point = np.concatenate([model_image.point for model_image in model.images])
+    xy = np.concatenate([model_image.xy for model_image in model.images]) - PIXEL_CENTRE
+    has_point = point != NO_POINT
+    if not has_point.all():
+        image, point, xy = image[has_point], point[has_point], xy[has_point]
     row = find_rows(model.points.ids, point)
     if len(row) and row.min() < 0:
         _refuse_unknown_points(model)
@@ -152,17 +154,20 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
     ray, warnings = image * len(model.points.ids) + row, ()
     in_order = np.sort(ray)
     if (in_order[1:] == in_order[:-1]).any():
-        _, first = np.unique(ray, return_index=True)
-        again = np.delete(image, first)
-        first.sort()
-        image, row, xy = image[first], row[first], xy[first]
-        names = dict.fromkeys(model.images[k].name for k in again.tolist())
+        _, first_rows = np.unique(ray, return_index=True)
+        repeated_rows = np.delete(image, first_rows)
+        first_rows.sort()
+        image, row, xy = image[first_rows], row[first_rows], xy[first_rows]
+        names = dict.fromkeys(model.images[k].name for k in repeated_rows.tolist())
         warnings = (
-            f"left out {count(len(again), 'image point')} of object points that have another in "
+            f"left out {count(len(repeated_rows), 'image point')} of object points that have "
+            "another in "
             f"the same image: {list_some(names)}",
         )
     columns = {
-        "image": RepeatedIds([one.name for one in model.images], image, are_rows=True),
+        "image": RepeatedIds(
+            [model_image.name for model_image in model.images], image, are_rows=True
+        ),
         "point": RepeatedIds(model.points.ids, row, are_rows=True),
         "x": xy[:, 0],
         "y": xy[:, 1],
@@ -171,19 +176,21 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
     return Columns(columns, source), warnings
 
 
-def find_rows(ids: Int[np.ndarray, " n"], wanted: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
+def find_rows(
+    ids: Int[np.ndarray, " n"], wanted_ids: Int[np.ndarray, " m"]
+) -> Int[np.ndarray, " m"]:
     """The rows of numbers in a column of different ones; −1 where there is none."""
-    if not len(ids) or not len(wanted):
-        return np.full(len(wanted), -1)
+    if not len(ids) or not len(wanted_ids):
+        return np.full(len(wanted_ids), -1)
     # Numbers with few gaps, as usual, are looked up in a table: a tenth of the time of a search.
     if ids.min() >= 0 and ids.max() < 8 * len(ids):
         table = np.full(ids.max() + 1, -1)
         table[ids] = np.arange(len(ids))
-        known = (wanted >= 0) & (wanted < len(table))
-        return np.where(known, table[np.where(known, wanted, 0)], -1)
+        is_known = (wanted_ids >= 0) & (wanted_ids < len(table))
+        return np.where(is_known, table[np.where(is_known, wanted_ids, 0)], -1)
     order = np.argsort(ids)
-    place = np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)
-    return np.where(ids[order[place]] == wanted, order[place], -1)
+    place = np.minimum(np.searchsorted(ids, wanted_ids, sorter=order), len(ids) - 1)
+    return np.where(ids[order[place]] == wanted_ids, order[place], -1)
 
 
 def _refuse_unknown_points(model: ColmapModel) -> None:
@@ -212,20 +219,20 @@ def from_network(network: Network) -> ColmapModel:
     q = quaternions_of(R)
     camera_numbers = list(cameras)
     point_numbers = np.array(numbers_of(points.id), np.int64)
-    made = []
+    images_made = []
     # The rays image by image, in one pass: masks of every image would be quadratic.
     order = np.argsort(rays.image, kind="stable")
     parts = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
-    for i, (number, mine) in enumerate(zip(numbers_of(images.id), parts)):
-        made.append(
+    for i, (number, rays_of_image) in enumerate(zip(numbers_of(images.id), parts)):
+        images_made.append(
             ColmapImage(
                 number,
                 camera_numbers[images.camera[i]],
                 images.id[i],
                 q[i],
                 t[i],
-                rays.xy[mine] + PIXEL_CENTRE,
-                point_numbers[rays.point[mine]],
+                rays.xy[rays_of_image] + PIXEL_CENTRE,
+                point_numbers[rays.point[rays_of_image]],
                 f"image {images.id[i]!r}",
             )
         )
@@ -233,7 +240,7 @@ def from_network(network: Network) -> ColmapModel:
     errors = np.nan_to_num(point_errors(network)[0], nan=-1.0)
     return ColmapModel(
         cameras,
-        made,
+        images_made,
         ColmapPoints(
             point_numbers, points.position, points.colour_or_grey(), points.source, errors
         ),

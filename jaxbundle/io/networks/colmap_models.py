@@ -71,20 +71,20 @@ def parameter_names(model: str, error: Callable[[str], InputError]) -> tuple[str
 
 def from_colmap(id: str, model: str, size: Sequence[int], values: Iterable[float]) -> Camera:
     """Our camera from one of COLMAP."""
-    _, ours, names = MODELS[model]
+    _, our_model, names = MODELS[model]
     p = dict(zip(names, map(float, values)))
     size = int(size[0]), int(size[1])
     if model == "EQUIRECTANGULAR":
-        return Camera(id, ours, _panorama(p["w"], p["h"]), image_size=size)
+        return Camera(id, our_model, _panorama(p["w"], p["h"]), image_size=size)
     f = p.pop("f", None)
     if f is not None:
         p = {"fx": f, "fy": f} | p
     p["cx"], p["cy"] = p["cx"] - PIXEL_CENTRE, p["cy"] - PIXEL_CENTRE
     if model == "FOV" and p["omega"] == 0:  # its formula divides by ω; the limit has no distortion
-        ours = "opencv"
+        our_model = "opencv"
         del p["omega"]
     tie = (("fx", "fy"),) if f is not None else ()
-    return Camera(id, ours, p, image_size=size, tie=tie)
+    return Camera(id, our_model, p, image_size=size, tie=tie)
 
 
 def _panorama(width: float, height: float) -> dict[str, float]:
@@ -104,7 +104,7 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
     """
     where = f"camera {camera.id!r}"
     candidates = [
-        (name, names) for name, (_, ours, names) in MODELS.items() if ours == camera.model
+        (name, names) for name, (_, our_model, names) in MODELS.items() if our_model == camera.model
     ]
     if not candidates:
         raise InputError(
@@ -113,8 +113,8 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
     size = size_of(camera, "COLMAP")
     p = all_parameters(camera)
     if camera.model == "equirectangular":
-        whole = _panorama(*map(float, size))
-        if not np.allclose([p[name] for name in whole], [*whole.values()], rtol=1e-12):
+        panorama = _panorama(*map(float, size))
+        if not np.allclose([p[name] for name in panorama], [*panorama.values()], rtol=1e-12):
             raise InputError(f"{where}: COLMAP has whole panoramas only, of the image size")
         return "EQUIRECTANGULAR", [float(size[0]), float(size[1])]
     p["cx"], p["cy"] = p["cx"] + PIXEL_CENTRE, p["cy"] + PIXEL_CENTRE

@@ -77,14 +77,15 @@ def rigs_of_frames(
 
     **Raises:** `InputError` for an image that is not in the model, or in two frames."""
     rows: list[tuple[str, str, str]] = []
-    seen: dict[int, int] = {}
+    frame_of_image: dict[int, int] = {}
     for frame in frames:
         for image in frame.images:
-            if image in seen:
+            if image in frame_of_image:
                 raise InputError(
-                    f"{frame.place}: image {image} is in frame {seen[image]} as well; expected one"
+                    f"{frame.place}: image {image} is in frame {frame_of_image[image]} as well; "
+                    "expected one"
                 )
-            seen[image] = frame.id
+            frame_of_image[image] = frame.id
         # Images without a pose are in a frame, but not in the model.
         images = [image for image in frame.images if image in names]
         if len(images) > 1:
@@ -102,13 +103,13 @@ class _Words:
     def __init__(self, row: TextRow):
         self.row, self.position = row, 0
 
-    def integer(self, what: str) -> int:
+    def integer(self, noun: str) -> int:
         self.position += 1
-        return self.row.integer(self.position - 1, what)
+        return self.row.integer(self.position - 1, noun)
 
-    def word(self, what: str) -> str:
+    def word(self, noun: str) -> str:
         if self.position >= len(self.row):
-            raise self.row.error(f"the line ends; expected {what}")
+            raise self.row.error(f"the line ends; expected {noun}")
         self.position += 1
         return self.row.words[self.position - 1]
 
@@ -154,11 +155,11 @@ def _text_frames(path: Path) -> list[ColmapFrame]:
     return frames
 
 
-def _entries(path: Path, what: str, least: int) -> Iterator[tuple[BinaryFile, int]]:
-    """The file at each of its entries, of `least` bytes or more; its end is checked."""
+def _entries(path: Path, noun: str, min_bytes: int) -> Iterator[tuple[BinaryFile, int]]:
+    """The file at each of its entries, of `min_bytes` bytes or more; its end is checked."""
     file = BinaryFile(path)
-    for k in range(file.count(what, least)):
-        file.what = f"{what.removesuffix('s')} {k + 1}"
+    for k in range(file.count(noun, min_bytes)):
+        file.what = f"{noun.removesuffix('s')} {k + 1}"
         yield file, k
     file.end()
 
@@ -224,14 +225,14 @@ def rigs_and_frames(
     """
     R, t = cv_pose(matrices_of(network.images.angles), network.images.position)
     # Names are kept if they are numbers.
-    named = {
+    rigs_by_name = {
         name: rig
         for kind in network.further
         if isinstance(kind, Rigs)
         for name, rig in kind.mounted(network).items()
     }
-    names = [(name, epoch) for name, rig in named.items() for epoch in rig.epochs]
-    rig_ids = dict(zip(named, numbers_of([*named])))
+    names = [(name, epoch) for name, rig in rigs_by_name.items() for epoch in rig.epochs]
+    rig_ids = dict(zip(rigs_by_name, numbers_of([*rigs_by_name])))
     epochs = [epoch for _, epoch in names]
     plain = len({*epochs}) == len(epochs)
     frame_ids = dict(zip(names, numbers_of(epochs) if plain else range(1, len(names) + 1)))
@@ -242,7 +243,7 @@ def rigs_and_frames(
     frames: list[WrittenFrame] = []
     made_R, made_t = R.copy(), t.copy()
     free = {*range(len(network.cameras))}  # cameras, images without a rig, a frame
-    left = {*range(len(network.images))}
+    images_left = {*range(len(network.images))}
 
     def add_frame(id: int, rig: int, sensors: Mapping[int, Pose], epoch: Mapping[int, int]) -> None:
         camera, image = next(((c, i) for c, i in epoch.items() if c == next(iter(sensors))),
@@ -251,43 +252,45 @@ def rigs_and_frames(
         R_frame, t_frame = Rs.T @ R[image], Rs.T @ (t[image] - ts)
         for c, i in epoch.items():
             made_R[i], made_t[i] = sensors[c][0] @ R_frame, sensors[c][0] @ t_frame + sensors[c][1]
-        left.difference_update(epoch.values())
+        images_left.difference_update(epoch.values())
         numbers = {cameras[c]: images[i] for c, i in epoch.items()}
-        frames.append(WrittenFrame(id, rig, _written(R_frame, t_frame), numbers))
+        frames.append(WrittenFrame(id, rig, _as_written(R_frame, t_frame), numbers))
 
     parted = 0
-    for name, rig in named.items():
+    for name, rig in rigs_by_name.items():
         sensors = _sensors(rig, free)
         if len(sensors) < 2:
             parted += sum(map(len, rig.epochs.values()))
             continue
         free -= sensors.keys()
-        _, *others = sensors
+        _, *other_sensors = sensors
         rigs.append(
             WrittenRig(
                 rig_ids[name],
                 cameras[rig.reference],
-                {cameras[c]: _written(*sensors[c]) for c in others},
+                {cameras[c]: _as_written(*sensors[c]) for c in other_sensors},
             )
         )
         for epoch, of_camera in rig.epochs.items():
-            mine = {c: i for c, i in of_camera.items() if c in sensors}
-            parted += len(of_camera) - len(mine)
-            if mine:
-                add_frame(frame_ids[name, epoch], rig_ids[name], sensors, mine)
-        for i in sorted(left):
+            images_of_sensors = {c: i for c, i in of_camera.items() if c in sensors}
+            parted += len(of_camera) - len(images_of_sensors)
+            if images_of_sensors:
+                add_frame(frame_ids[name, epoch], rig_ids[name], sensors, images_of_sensors)
+        for i in sorted(images_left):
             if (c := int(network.images.camera[i])) in sensors:
                 add_frame(next(new_frame), rig_ids[name], sensors, {c: i})
     for c in sorted(free):
         rigs.append(WrittenRig(next(new_rig), cameras[c], {}))
-        alone = {c: (np.eye(3), np.zeros(3))}
+        single_camera = {c: (np.eye(3), np.zeros(3))}
         for i in np.flatnonzero(network.images.camera == c).tolist():
-            if i in left:
-                add_frame(next(new_frame), rigs[-1].id, alone, {c: i})
-    lost = [f"the rig of {count(parted, 'image')}"] if parted else []
-    if [*map(str, rig_ids.values())] != [*named] or [*map(str, frame_ids.values())] != epochs:
-        lost.append("names of rigs and epochs, which are numbered")
-    return rigs, frames, lost + _changed(R, t, made_R, made_t)
+            if i in images_left:
+                add_frame(next(new_frame), rigs[-1].id, single_camera, {c: i})
+    losses = [f"the rig of {count(parted, 'image')}"] if parted else []
+    if [*map(str, rig_ids.values())] != [*rigs_by_name] or [
+        *map(str, frame_ids.values())
+    ] != epochs:
+        losses.append("names of rigs and epochs, which are numbered")
+    return rigs, frames, losses + _changed(R, t, made_R, made_t)
 
 
 def _sensors(rig: MountedCameras, free: Container[int]) -> dict[int, Pose]:
@@ -303,7 +306,7 @@ def _sensors(rig: MountedCameras, free: Container[int]) -> dict[int, Pose]:
     }
 
 
-def _written(R: np.ndarray, t: np.ndarray) -> SensorPose:
+def _as_written(R: np.ndarray, t: np.ndarray) -> SensorPose:
     return SensorPose(quaternions_of(R[None])[0], t)
 
 
@@ -337,9 +340,11 @@ def _text_files(rigs: Sequence[WrittenRig], frames: Sequence[WrittenFrame]) -> d
         "SENSOR_ID, HAS_POSE, [QW, QX, QY, QZ, TX, TY, TZ])"
     ]
     for rig in rigs:
-        others = (f" {CAMERA} {c} 1 {join_numbers((*q, *t))}" for c, (q, t) in rig.others.items())
+        other_sensors = (
+            f" {CAMERA} {c} 1 {join_numbers((*q, *t))}" for c, (q, t) in rig.others.items()
+        )
         head = f"{rig.id} {1 + len(rig.others)} {CAMERA} {rig.reference}"
-        rig_lines.append(head + "".join(others))
+        rig_lines.append(head + "".join(other_sensors))
     frame_lines = [
         "# FRAME_ID, RIG_ID, QW, QX, QY, QZ, TX, TY, TZ, NUM_DATA_IDS, DATA_IDS[] as "
         "(SENSOR_TYPE, SENSOR_ID, DATA_ID)"

@@ -57,7 +57,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
             raise row.error(f"camera {number} occurs twice")
         model = row.words[1] if len(row) > 1 else ""
         names = parameter_names(model, row.error)
-        size = [row.integer(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
+        size = [row.integer(k, noun, 1) for k, noun in ((2, "WIDTH"), (3, "HEIGHT"))]
         values = row.numbers(names, 4)
         cameras[number] = from_colmap(str(number), model, size, values)
     return cameras
@@ -112,8 +112,8 @@ def _images(path: Path) -> list[ColmapImage]:
 def _points(path: Path, images: set[int]) -> ColmapPoints:
     """The points; tracks are only checked, since the image points name their object points."""
     rows = TextRows(path, "#")
-    if (found := _plain_points(path, rows.lines, images)) is not None:
-        return found
+    if (parsed := _plain_points(path, rows.lines, images)) is not None:
+        return parsed
     ids, values, lines = [], [], []
     for row in rows:
         ids.append(row.integer(0, "POINT3D_ID"))
@@ -144,12 +144,12 @@ def _plain_points(
     plain = len(ends) == len(lines) and (number >= 8).all() and (number % 2 == 0).all()
     if not plain or not (np.abs(numbers) < 2**52).sum() == len(numbers) - len(ends):
         return None
-    first = ends - number
+    first_words = ends - number
     is_track = np.ones(len(numbers), bool)
     is_track[ends] = False
-    is_track[first[:, None] + np.arange(8)] = False
+    is_track[first_words[:, None] + np.arange(8)] = False
     # Pairs of an image and the index of its image point.
-    track, ids = numbers[is_track][::2], numbers[first]
+    track, ids = numbers[is_track][::2], numbers[first_words]
     image = track.astype(np.int64)  # whole numbers are looked up in a table, others sorted
     if (image != track).any() or not np.isin(image, [*images]).all():
         return None
@@ -159,7 +159,7 @@ def _plain_points(
     # The line of every point.
     source = Source(str(path), np.array([number for number, _ in lines], np.int64), "line")
     check_unique(ids, source, "point")
-    values = numbers[first[:, None] + np.arange(1, 7)]
+    values = numbers[first_words[:, None] + np.arange(1, 7)]
     return ColmapPoints(ids, values[:, :3], values[:, 3:], source)
 
 

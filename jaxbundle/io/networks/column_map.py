@@ -119,7 +119,7 @@ def read_column_map(
             raise InputError(f"{path}: [table.{name}] is missing")
     for name, entry in maps.items():
         where = f"{path}, [table.{name}]"
-        columns = _read(path.parent, where, entry)
+        columns = _read_table(path.parent, where, entry)
         if name == "images":
             columns = _rotate(where, entry, columns, ANGLE_UNITS.get(angle_unit, 1.0))
         if name == "points" and "role" not in columns.values:
@@ -129,7 +129,7 @@ def read_column_map(
     return network_of(settings, tables, str(path), models)
 
 
-def _read(folder: Path, where: str, entry: Mapping) -> Columns:
+def _read_table(folder: Path, where: str, entry: Mapping) -> Columns:
     """A table by its map; numbers scaled."""
     for key in entry:
         refuse_unknown(key, KEYS, f"{where}: ")
@@ -138,14 +138,14 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
         raise InputError(f"{where}: file is {show(file)}; expected the name of a file")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: columns must be a list of names")
-    more = bool(names) and names[-1] == ANY_FURTHER
-    names = names[:-1] if more else names
-    used = {name: k for k, name in enumerate(names) if name != UNUSED_COLUMN}
-    if len(used) + names.count(UNUSED_COLUMN) < len(names):
+    allows_more = bool(names) and names[-1] == ANY_FURTHER
+    names = names[:-1] if allows_more else names
+    column_of = {name: k for k, name in enumerate(names) if name != UNUSED_COLUMN}
+    if len(column_of) + names.count(UNUSED_COLUMN) < len(names):
         raise InputError(f"{where}: a column occurs twice")
     scale, constant = (_table(where, entry, key) for key in ("scale", "constant"))
     for name, factor in scale.items():
-        if name not in used or name in IDS:
+        if name not in column_of or name in IDS:
             raise InputError(f"{where}: scale of {name!r}: no such column of numbers")
         if isinstance(factor, bool) or not isinstance(factor, int | float) or factor == 0:
             raise InputError(f"{where}: scale of {name} is {show(factor)}; expected a number")
@@ -157,16 +157,16 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
     comment = entry.get("comment", "")
     if not isinstance(comment, str):
         raise InputError(f"{where}: comment is {show(comment)}; expected text")
-    texts: dict[str, list[str]] = {name: [] for name in used}
+    texts: dict[str, list[str]] = {name: [] for name in column_of}
     lines = []
     for row in TextRows(folder / file, comment, separator=_separator(where, entry)):
         if row.number <= skip:
             continue
-        if len(row) < len(names) or (len(row) > len(names) and not more):
+        if len(row) < len(names) or (len(row) > len(names) and not allows_more):
             raise row.error(
                 f"{len(row)} columns where {where} has {len(names)}: {', '.join(names)}"
             )
-        for name, k in used.items():
+        for name, k in column_of.items():
             text = row.words[k]
             swap = decimal == "," and name not in IDS  # an id may have a comma
             texts[name].append(text.replace(",", ".") if swap else text)
@@ -215,6 +215,6 @@ def _rotate(where: str, entry: Mapping, columns: Columns, radians: float) -> Col
             raise InputError(f"{columns.source(row)}: m11 … m33 are not a rotation matrix")
     else:
         M = apply_in_batches(formula, numbers * radians, (3,), (3, 3))
-    rest = {name: column for name, column in columns.values.items() if name not in names}
+    other_columns = {name: column for name, column in columns.values.items() if name not in names}
     angles = dict(zip(("omega", "phi", "kappa"), angles_of(M).T / radians))
-    return Columns({**rest, **angles}, columns.source)
+    return Columns({**other_columns, **angles}, columns.source)

@@ -186,23 +186,25 @@ def select_checks(points: Points, selection: Sequence[str]) -> Points:
 
     **Raises:** `InputError` for a name that is not a control point, or if no control is left."""
     rows = np.flatnonzero(points.has_role("control", "fixed", "check"))
-    known = [points.id[k] for k in rows]
-    chosen: set[str] = set()
+    control_ids = [points.id[k] for k in rows]
+    chosen_ids: set[str] = set()
     for text in selection:
-        every = EVERY.match(text.strip())
-        if every and (step := int(every[1])) > 1:
-            chosen |= {*known[step // 2 :: step]}
+        every_match = EVERY.match(text.strip())
+        if every_match and (step := int(every_match[1])) > 1:
+            chosen_ids |= {*control_ids[step // 2 :: step]}
             continue
-        for name in [text] if text in known else [part.strip() for part in text.split(",")]:
-            if name not in known:
+        for name in [text] if text in control_ids else [part.strip() for part in text.split(",")]:
+            if name not in control_ids:
                 raise InputError(
                     f"--check {name}: expected a control point of {points.source.name}, or every "
-                    f"3rd{did_you_mean(name, known)}"
+                    f"3rd{did_you_mean(name, control_ids)}"
                 )
-            chosen.add(name)
-    roles = tuple("check" if id in chosen else role for id, role in zip(points.id, points.role))
-    if chosen and not {"control", "fixed"} & set(roles):
-        raise InputError(f"--check: all {len(known)} control points are check points; none is left")
+            chosen_ids.add(name)
+    roles = tuple("check" if id in chosen_ids else role for id, role in zip(points.id, points.role))
+    if chosen_ids and not {"control", "fixed"} & set(roles):
+        raise InputError(
+            f"--check: all {len(control_ids)} control points are check points; none is left"
+        )
     return dataclasses.replace(points, role=roles)
 
 
@@ -231,15 +233,15 @@ def with_control(
         raise InputError(f"{control.source.name}: {degrees}")
     network = _transform_into_frame(network, places, control.take(np.array(rows)), settings)
     points = network.points
-    named = np.zeros(len(points), bool)
-    named[places] = True
+    is_named = np.zeros(len(points), bool)
+    is_named[places] = True
     dropped = [
         id
-        for id, role, there in zip(points.id, points.role, named)
-        if role in ("control", "fixed") and not there
+        for id, role, is_there in zip(points.id, points.role, is_named)
+        if role in ("control", "fixed") and not is_there
     ]
     roles = np.array(points.role, dtype=object)
-    roles[points.has_role("control", "fixed") & ~named] = "tie"
+    roles[points.has_role("control", "fixed") & ~is_named] = "tie"
     roles[places] = [control.role[k] for k in rows]
     position, sigma = points.position.copy(), np.full_like(points.sigma, np.nan)
     position[places], sigma[places] = control.position[rows], control.sigma[rows]
@@ -250,7 +252,7 @@ def with_control(
         ),
         **changed,
     )
-    lost = [id for id in control.id if id not in index]
+    missing_ids = [id for id in control.id if id not in index]
     warnings, notes = [], []
     if dropped:
         points = count(len(dropped), "control point")
@@ -258,8 +260,10 @@ def with_control(
             f"{points} of the input not in {control.source.name} became tie points: "
             f"{list_some(dropped)}"
         )
-    if lost:
-        notes.append(f"{control.source.name}: no photograph shows the points {list_some(lost)}")
+    if missing_ids:
+        notes.append(
+            f"{control.source.name}: no photograph shows the points {list_some(missing_ids)}"
+        )
     return network.warn(*warnings).note(*notes)
 
 
@@ -278,8 +282,8 @@ def _transform_into_frame(
     source = points.position[places]
     if np.isnan(source).any():
         source = _intersect(network, places)
-    known = np.isfinite(source).all(1)
-    source, target = source[known], target[known]
+    is_known = np.isfinite(source).all(1)
+    source, target = source[is_known], target[is_known]
     # Seven parameters of a similarity: three points give nine coordinates.
     transformation = similarity(source, target) if len(source) >= 3 else None
     extent = np.ptp(target, axis=0).max() if len(target) else 0.0
@@ -289,9 +293,9 @@ def _transform_into_frame(
     if np.median(np.linalg.norm(source - target, axis=1)) <= settings.max_offset * extent:
         return network
     A, t = transformation
-    off = np.linalg.norm(source @ A.T + t - target, axis=1)
+    misfit = np.linalg.norm(source @ A.T + t - target, axis=1)
     _check_similarity(
-        off, control.take(np.flatnonzero(known)), settings.max_misfit, network.object_unit
+        misfit, control.take(np.flatnonzero(is_known)), settings.max_misfit, network.object_unit
     )
     scale = float(np.cbrt(np.linalg.det(A)))  # A = scale·R, det R = 1
     if abs(abs(np.log(scale)) - np.log(1000)) < np.log(1 + settings.thousand_tolerance):
@@ -321,17 +325,19 @@ def _transform_into_frame(
 
 
 def _check_similarity(
-    off: Float[np.ndarray, " n"], control: Points, max_misfit: float, unit: str
+    misfit: Float[np.ndarray, " n"], control: Points, max_misfit: float, unit: str
 ) -> None:
-    """Refuse control that is `off` the similarity by more than `max_misfit` of its spread: the
+    """Refuse control that is `misfit` the similarity by more than `max_misfit` of its spread: the
     network would not be in its frame."""
-    spread = np.sqrt(np.square(control.position - control.position.mean(0)).sum(1).mean())
-    if np.median(off) > max_misfit * spread:
-        worst = (f"{control.id[k]!r} by {off[k]:.3g}" for k in np.argsort(-off))
+    extent = np.sqrt(np.square(control.position - control.position.mean(0)).sum(1).mean())
+    if np.median(misfit) > max_misfit * extent:
+        worst = (f"{control.id[k]!r} by {misfit[k]:.3g}" for k in np.argsort(-misfit))
         raise InputError(
             f"{control.source.name}: the control fits no similarity of the start values of the "
-            f"input: its {count(len(off), 'point')} are within {spread:.3g} {unit} of their mean "
-            f"and {np.median(off):.3g} off (median), most of all {list_some(worst, 3, str)}; check "
+            f"input: its {count(len(misfit), 'point')} are within {extent:.3g} {unit} of their "
+            "mean "
+            f"and {np.median(misfit):.3g} off (median), most of all {list_some(worst, 3, str)}; "
+            "check "
             "names and units of the table, or leave out the start values of the input"
         )
 
@@ -354,6 +360,6 @@ def _intersect(network: Network, places: Int[np.ndarray, " n"]) -> Float[np.ndar
         intersected = find_start_values(start).network.points
     except (InputError, NotSolvedError):
         return position[places]
-    known = dict(zip(intersected.id, intersected.position))
+    position_of = dict(zip(intersected.id, intersected.position))
     nothing = np.full(3, np.nan)
-    return np.array([known.get(points.id[k], nothing) for k in places])
+    return np.array([position_of.get(points.id[k], nothing) for k in places])

@@ -124,8 +124,8 @@ def read_csm_frame(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     source = Source(str(path), None, "photograph")
     images = image_columns(source, names, [id] * len(names), M, X0)
     document = foreign_document(path.stem, [entry_of(camera)], object_unit="m")
-    told = (*warnings, *fit_messages([camera]), *unknown.messages())
-    return assemble(path, document, overrides, images, warnings=told)
+    messages = (*warnings, *fit_messages([camera]), *unknown.messages())
+    return assemble(path, document, overrides, images, warnings=messages)
 
 
 def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
@@ -135,13 +135,13 @@ def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
         from jaxbundle.io.scanner.csm_state import frame_support_data_of
 
         # A state: the name of its model, then an object.
-        name, _, rest = text.lstrip().partition("\n")
+        name, _, after_name = text.lstrip().partition("\n")
         if name.strip() != MODEL:
             raise InputError(
                 f"{path}: a model state of {show(name.strip()[:60])}; expected one of {MODEL}, or "
                 "support data (ISD)"
             )
-        state = JsonFields(path, read_object(path, rest, "a model state"))
+        state = JsonFields(path, read_object(path, after_name, "a model state"))
         return JsonFields(path, frame_support_data_of(state)), unknown
     isd = JsonFields(path, read_object(path, text, "an ISD"))
     if isd.get("name_model") not in (MODEL, PUSH_FRAME):
@@ -174,11 +174,12 @@ def _framelets(
             f"{isd.path}: framelets_flipped: the lines of every framelet are in reverse order, a "
             "mirror image, which no camera here has; turn them round and set it to false"
         )
-    number, rest = divmod(lines, height)
+    number, lines_left = divmod(lines, height)
     warnings = []
-    if rest:
+    if lines_left:
         warnings.append(
-            f"{isd.path}: {lines} lines are {number} framelets of {height} and {rest} more lines, "
+            f"{isd.path}: {lines} lines are {number} framelets of {height} and {lines_left} more "
+            "lines, "
             "which are left out"
         )
     if number == 0:
@@ -188,9 +189,9 @@ def _framelets(
         raise InputError(f"{isd.path}: interframe_delay is {delay:g}; expected seconds above 0")
     k = np.arange(number)
     k = k[::-1] if flags["framelet_order_reversed"] else k
-    first = isd.number("starting_ephemeris_time") + isd.number("exposure_duration") / 2
-    P, R, said = poses_at(isd, first - isd.number("center_ephemeris_time") + k * delay)
-    return plane._replace(size=(plane.size[0], height)), P, R.as_matrix(), (*said, *warnings)
+    first_time = isd.number("starting_ephemeris_time") + isd.number("exposure_duration") / 2
+    P, R, messages = poses_at(isd, first_time - isd.number("center_ephemeris_time") + k * delay)
+    return plane._replace(size=(plane.size[0], height)), P, R.as_matrix(), (*messages, *warnings)
 
 
 class FocalPlane(NamedTuple):
@@ -231,17 +232,17 @@ def _focal_plane(isd: JsonFields) -> FocalPlane:
     to_mm = np.linalg.inv(A) * summing
     start = np.array([isd.number(f"starting_detector_{k}", 0.0) for k in ("sample", "line")])
     middle = np.array([isd.number(f"detector_center.{k}") for k in ("sample", "line")])
-    first = np.array([along_sample[0], along_line[0]])
-    centre = (middle + first - start) / summing - 0.5
+    first_coordinates = np.array([along_sample[0], along_line[0]])
+    centre = (middle + first_coordinates - start) / summing - 0.5
     if np.linalg.det(to_mm) * np.sign(f) < 0:
         raise InputError(
             f"{isd.path}: focal2pixel_lines and focal2pixel_samples make a mirror image, which no "
             "camera here has; mirror the image, and negate the coefficients of its lines"
         )
-    across = to_mm[:, 0] / np.linalg.norm(to_mm[:, 0])
+    sample_direction = to_mm[:, 0] / np.linalg.norm(to_mm[:, 0])
     # y against the lines; of a plane with skew, at right angles to the samples
-    up = np.array([across[1], -across[0]]) * np.sign(f)
-    axes = np.array([[*across, 0.0], [*up, 0.0], [0.0, 0.0, -np.sign(f)]])
+    upward = np.array([sample_direction[1], -sample_direction[0]]) * np.sign(f)
+    axes = np.array([[*sample_direction, 0.0], [*upward, 0.0], [0.0, 0.0, -np.sign(f)]])
     return FocalPlane(to_mm, centre, axes, size, abs(f))
 
 
@@ -264,9 +265,11 @@ def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
     match kind:
         case "radial" | "cahvor":
             k = np.r_[numbers(None), np.zeros(6)]
-            known = 5 if kind == "cahvor" else 3
-            if k[known:].any():
-                raise InputError(f"{isd.path}: {where}: at most {known} coefficients are known")
+            number_known = 5 if kind == "cahvor" else 3
+            if k[number_known:].any():
+                raise InputError(
+                    f"{isd.path}: {where}: at most {number_known} coefficients are known"
+                )
             offset = k[3:5] if kind == "cahvor" else np.zeros(2)
             if skewed or offset.any():
                 p = {"k": k[:3], "offset": offset}
@@ -278,10 +281,12 @@ def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
                 numbers(5) if kind == "radtan" else (numbers(1)[0] * f * f, 0, 0, 0, 0)
             )
             turned = Q @ [p2, p1] * np.sign(-plane.axes[2, 2])
-            own = {"k1": k1, "k2": k2, "k3": k3, "p1": -turned[1], "p2": turned[0]}
+            distortion = {"k1": k1, "k2": k2, "k3": k3, "p1": -turned[1], "p2": turned[0]}
             if skewed:
                 raise InputError(f"{isd.path}: {where} with skewed pixels is not supported")
-            return _opencv(id, plane, {**focal, **{name: float(v) for name, v in own.items()}})
+            return _opencv(
+                id, plane, {**focal, **{name: float(v) for name, v in distortion.items()}}
+            )
         case "transverse":
             a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
             p = {"a": np.r_[a, np.zeros(10)][:10], "b": np.r_[b, np.zeros(10)][:10]}
@@ -323,14 +328,14 @@ def _fit(
     why: str,
 ) -> Camera:
     """The nearest camera: the pixels of rays by the formula of the ISD."""
-    own = {
+    isd_parameters = {
         "distortion": dict(p),
         "f": plane.focal_length,
         "axes": plane.axes[:2, :2],
         "to_pixel": np.linalg.inv(plane.to_mm),
         "centre": plane.centre,
     }
-    foreign = Foreign(formula, own, start, plane.size, plane.pixel_size)
+    foreign = Foreign(formula, isd_parameters, start, plane.size, plane.pixel_size)
     return fit_camera(id, foreign, str(isd.path), why)
 
 

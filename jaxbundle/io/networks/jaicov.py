@@ -58,9 +58,9 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     path = Path(path)
     beside = {suffix: path.with_suffix(suffix) for suffix in COMPANION_SUFFIXES}
     cameras = _cameras(beside[".ior"])
-    images, angles, position, camera, told = _images(beside[".eor"])
+    images, angles, position, camera, messages = _images(beside[".eor"])
     points, coordinates, datum = _points(beside[".obc"])
-    rays, lines, more = _rays(path, points if beside[".obc"].is_file() else None)
+    rays, lines, ray_messages = _rays(path, points if beside[".obc"].is_file() else None)
     for image in rays["image"]:
         images.setdefault(image, len(images))
     for point in rays["point"]:
@@ -68,7 +68,7 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     # Images and points that only the image points name follow those of .eor and .obc, as unknown.
     X0, all_angles = np.full((2, len(images), 3), np.nan)
     X0[: len(position)], all_angles[: len(angles)] = position, angles
-    used = camera + [str(next(iter(cameras)))] * (len(images) - len(camera))
+    camera_of_image = camera + [str(next(iter(cameras)))] * (len(images) - len(camera))
     X = np.full((len(points), 3), np.nan)
     X[: len(coordinates)] = coordinates
     network = assemble(
@@ -80,7 +80,7 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         image_columns(
             Source(str(beside[".eor"]), None, "image"),
             list(images),
-            used,
+            camera_of_image,
             matrices_of(all_angles),
             X0,
         ),
@@ -89,7 +89,7 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             Source(str(beside[".obc"]), None, "point"),
         ),
         Columns(rays, Source(str(path), np.array(lines, np.int64), "line")),
-        (*told, *more),
+        (*messages, *ray_messages),
     )
     return _with_distances(network, beside[".scale"])
 
@@ -98,18 +98,18 @@ def _cameras(file: Path) -> dict[str, dict]:
     """The entries of cameras by number."""
     rows, cameras = TextRows(file, comment="#"), {}
     while rows.more():
-        entry, first = {}, None
+        entry, first_row = {}, None
         for names in INTERIOR:
             row = rows.take(f"{', '.join(names)} of a camera")
             entry |= dict(zip(names, row.numbers(names, more=True).tolist()))
-            first = first or row
-        assert first is not None
+            first_row = first_row or row
+        assert first_row is not None
         size = entry["columns"], entry["rows"]
         if not (entry["c"] < 0 and min(entry["width"], entry["height"], *size) > 0):
             raise row.error("c must be negative, the sizes of the sensor positive")
-        id = first.words[0]
+        id = first_row.words[0]
         if id in cameras:
-            raise first.error(f"camera {id} occurs twice")
+            raise first_row.error(f"camera {id} occurs twice")
         values = {
             name: entry[name]
             for name in ("x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2", "r0")
@@ -134,7 +134,7 @@ def _images(
 ]:
     """Row of each image, angles, positions, cameras, and messages."""
     images: dict[str, int] = {}
-    angles, position, camera, other = [], [], [], []
+    angles, position, camera, other_order = [], [], [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
         names = ("X0", "Y0", "Z0", "omega", "phi", "kappa", "order", "active", "state")
         entry = dict(zip(names, row.numbers(names, 2, more=True).tolist()))
@@ -144,20 +144,21 @@ def _images(
         # Order 0: ω, φ, κ; state 1: not oriented, 2: approximately, 3: by bundle adjustment.
         good = entry["order"] == 0 and entry["state"] != 1
         if entry["order"] != 0:
-            other.append(row.words[0])
+            other_order.append(row.words[0])
         values = [entry[name] if good else np.nan for name in names[:6]]
         position.append(values[:3])
         angles.append(values[3:])
         camera.append(row.words[1])
-    told = (
+    messages = (
         [
-            f"{count(len(other), 'image')} whose rotation is of another order than 0: without "
-            f"orientation: {list_some(other)}"
+            f"{count(len(other_order), 'image')} whose rotation is of another order than 0: "
+            "without "
+            f"orientation: {list_some(other_order)}"
         ]
-        if other
+        if other_order
         else []
     )
-    return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, told)
+    return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, messages)
 
 
 def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[str]]:
@@ -176,9 +177,9 @@ def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[
     return points, np.reshape(coordinates, (-1, 3)), datum
 
 
-def _number_row(row: TextRow, table: dict[str, int], thing: str) -> None:
+def _number_row(row: TextRow, table: dict[str, int], noun: str) -> None:
     if row.words[0] in table:
-        raise row.error(f"{thing} {row.words[0]} occurs twice")
+        raise row.error(f"{noun} {row.words[0]} occurs twice")
     table[row.words[0]] = len(table)
 
 
@@ -202,9 +203,11 @@ def _rays(
         lines.append(row.number)
     if not lines:
         raise InputError(f"{file}: there are no active image points")
-    what = "left out {} of points that are not in .obc, or not active there: {}"
-    told = [what.format(count(len(unknown), "image point"), list_some(dict.fromkeys(unknown)))]
-    return columns, lines, told if unknown else []
+    template = "left out {} of points that are not in .obc, or not active there: {}"
+    messages = [
+        template.format(count(len(unknown), "image point"), list_some(dict.fromkeys(unknown)))
+    ]
+    return columns, lines, messages if unknown else []
 
 
 def _with_distances(network: Network, file: Path) -> Network:
@@ -213,18 +216,18 @@ def _with_distances(network: Network, file: Path) -> Network:
     ends, values = [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
         # The name stands in quotes and may have blanks.
-        rest = TextRow(
+        words_after = TextRow(
             row.path,
             row.number,
             row.text.rpartition('"')[2] if '"' in row.text else " ".join(row.words[1:]),
         )
-        length, sigma, active = rest.numbers(("length", "σ", "active"), 2, more=True)
+        length, sigma, active = words_after.numbers(("length", "σ", "active"), 2, more=True)
         # An end that was left out above leaves nothing to measure.
-        if active == 0 or not {*rest.words[:2]} <= {*index}:
+        if active == 0 or not {*words_after.words[:2]} <= {*index}:
             continue
         if not (length > 0 and sigma > 0):
             raise row.error("length and σ must be positive")
-        ends.append([index[id] for id in rest.words[:2]])
+        ends.append([index[id] for id in words_after.words[:2]])
         values.append((length, sigma))
         lines.append(row.number)
     if not ends:

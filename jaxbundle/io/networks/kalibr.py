@@ -137,14 +137,14 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     for fields in chain.values():
         unknown.check(fields.document, KEYS, fields.path)
     cameras = [_camera(id, fields) for id, fields in chain.items()]
-    poses, told = _poses(list(chain.values()))
+    poses, messages = _poses(list(chain.values()))
     return rig_network(
         path,
         cameras,
         [*poses[:, :3, :3]],
         [*poses[:, :3, 3]],
         overrides,
-        (*told, *unknown.messages()),
+        (*messages, *unknown.messages()),
     )
 
 
@@ -161,15 +161,15 @@ def _poses(chain: Sequence[JsonFields]) -> tuple[Float[np.ndarray, "cameras 4 4"
         # A chain may be broken and go on through the body.
         if fields.get("T_cn_cnm1") is not None:
             poses[k] = _transform(fields, "T_cn_cnm1") @ poses[k - 1]
-    for k, mine in enumerate(body):
-        known = (
-            (other, poses[j])
-            for j, other in enumerate(body)
-            if other is not None and j != k and np.isfinite(poses[j]).all()
+    for k, pose_in_body in enumerate(body):
+        known_poses = (
+            (other_pose, poses[j])
+            for j, other_pose in enumerate(body)
+            if other_pose is not None and j != k and np.isfinite(poses[j]).all()
         )
-        if mine is not None and np.isnan(poses[k]).any():
-            for other, place in known:
-                poses[k] = mine @ np.linalg.inv(other) @ place
+        if pose_in_body is not None and np.isnan(poses[k]).any():
+            for other_pose, place in known_poses:
+                poses[k] = pose_in_body @ np.linalg.inv(other_pose) @ place
                 break
     for k, fields in enumerate(chain[1:], 1):
         if fields.get("T_cn_cnm1") is not None and np.isnan(poses[k]).any():
@@ -179,10 +179,10 @@ def _poses(chain: Sequence[JsonFields]) -> tuple[Float[np.ndarray, "cameras 4 4"
         for key in (*BODY, "timeshift_cam_imu")
         if any(fields.get(key) is not None for fields in chain)
     ]
-    told = [
+    messages = [
         f"{chain[0].path}: the frame is that of the first camera; not kept: {', '.join(unread)}"
     ]
-    return poses, told if unread else []
+    return poses, messages if unread else []
 
 
 def _body_pose(fields: JsonFields) -> Float[np.ndarray, "4 4"] | None:
@@ -214,20 +214,20 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     kind = fields.text("camera_model", "pinhole"), fields.text("distortion_model", "none").lower()
     kind = kind[0], DISTORTION_NAMES.get(kind[1], kind[1])
     if kind not in READ_MODELS:
-        known = ", ".join("-".join(names) for names in READ_MODELS)
+        known_models = ", ".join("-".join(names) for names in READ_MODELS)
         raise InputError(
             f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; expected one "
-            f"of {known}"
+            f"of {known_models}"
         )
     model, core, coefficients = READ_MODELS[kind]
     values = fields.array("intrinsics", (len(core),))
     spelled = next((k for k in COEFFICIENT_KEYS if fields.get(k) is not None), COEFFICIENT_KEYS[0])
-    more = fields.array(spelled, (len(coefficients),)) if coefficients else ()
+    distortion = fields.array(spelled, (len(coefficients),)) if coefficients else ()
     if not coefficients and np.any(fields.get(spelled) or 0):
         raise InputError(f"{fields.path}: {spelled} of distortion_model none; expected none")
     w, h = fields.array("resolution", (2,))
     size = JsonFields(f"{fields.path}: resolution", {"w": w, "h": h})
-    parameters = dict(zip((*core, *coefficients), map(float, (*values, *more))))
+    parameters = dict(zip((*core, *coefficients), map(float, (*values, *distortion))))
     return Camera(
         id, model, parameters, image_size=(size.integer("w", least=1), size.integer("h", least=1))
     )
@@ -240,12 +240,12 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
 
     **Raises:** `InputError` for a camera without a model in Kalibr, or without image size.
     """
-    mountings, lines, lost = mountings_of(network), [], []
+    mountings, lines, losses = mountings_of(network), [], []
     if mountings is None and len(network.cameras) > 1:
-        lost.append("mountings of the cameras")
+        losses.append("mountings of the cameras")
     for k, original in enumerate(network.cameras):
-        camera, said = _fit(original)
-        lost += said
+        camera, fit_messages_of_camera = _fit(original)
+        losses += fit_messages_of_camera
         lines += [f"cam{k}:", *(f"  {line}" for line in _camera_lines(camera, k))]
         if mountings is not None and k:
             lines += [
@@ -253,17 +253,17 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
                 *(f"  - [{join_numbers(row, ', ')}]" for row in mountings[k - 1]),
             ]
     write_text(Path(path), "\n".join(lines) + "\n")
-    return (*describe_losses(network, KALIBR_LOSSES), *lost)
+    return (*describe_losses(network, KALIBR_LOSSES), *losses)
 
 
 def _fit(camera: Camera) -> tuple[Camera, list[str]]:
     """A camera with more coefficients than Kalibr's radtan as the nearest radtan or equi, and the
     difference in words."""
     p = all_parameters(camera)
-    more = [name for name, value in p.items() if value and name not in (*CORE, *RADTAN)]
-    if camera.model != "opencv" or not more:
+    unwritable = [name for name, value in p.items() if value and name not in (*CORE, *RADTAN)]
+    if camera.model != "opencv" or not unwritable:
         return camera, []
-    size, fits, refused = size_of(camera, "Kalibr"), [], ""
+    size, fits, reason = size_of(camera, "Kalibr"), [], ""
     for target, free in (("opencv", (*CORE, *RADTAN)), ("kannala-brandt", ())):
         try:
             fits.append(
@@ -272,25 +272,25 @@ def _fit(camera: Camera) -> tuple[Camera, list[str]]:
                 )
             )
         except ValueError as error:
-            refused = refused or str(error)
+            reason = reason or str(error)
     if not fits:
-        raise InputError(f"camera {camera.id!r}: Kalibr has no {', '.join(more)}: {refused}")
+        raise InputError(f"camera {camera.id!r}: Kalibr has no {', '.join(unwritable)}: {reason}")
     best = min(fits, key=lambda fit: fit.rms)
     message = (
-        f"{', '.join(more)} of camera {camera.id!r}, fitted as "
+        f"{', '.join(unwritable)} of camera {camera.id!r}, fitted as "
         f"{'radtan' if best.model == 'opencv' else 'equi'} over the image: largest difference "
         f"{best.largest:.3g} px, RMS {best.rms:.3g} px (none if the rig is calibrated without)"
     )
-    made = dataclasses.replace(camera, model=best.model, parameters=dict(best.parameters))
-    return made, [message]
+    fitted = dataclasses.replace(camera, model=best.model, parameters=dict(best.parameters))
+    return fitted, [message]
 
 
 def _camera_lines(camera: Camera, k: int) -> list[str]:
     """The entries of a camera, by the first model of Kalibr that holds it."""
     p, (w, h) = all_parameters(camera), size_of(camera, "Kalibr")
     for (kind, distortion), (model, core, coefficients) in MODELS.items():
-        named = {*core, *coefficients}
-        if model == camera.model and not any(p[name] for name in p if name not in named):
+        written_names = {*core, *coefficients}
+        if model == camera.model and not any(p[name] for name in p if name not in written_names):
             values = join_numbers((p[name] for name in coefficients), ", ")
             return [
                 f"camera_model: {kind}",
@@ -300,15 +300,15 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
                 f"resolution: [{w}, {h}]",
                 f"rostopic: /cam{k}/image_raw",
             ]
-    known = [names for model, *names in MODELS.values() if model == camera.model]
-    if not known:
+    known_names = [names for model, *names in MODELS.values() if model == camera.model]
+    if not known_names:
         raise InputError(
             f"camera {camera.id!r}: Kalibr has no model {str(camera.model)!r}; convert it with "
             "--model opencv"
         )
-    most = {name for names in known for part in names for name in part}
-    rest = ", ".join(name for name, value in p.items() if value and name not in most)
-    raise InputError(f"camera {camera.id!r}: Kalibr has no {rest}; adjust the camera without")
+    all_names = {name for names in known_names for part in names for name in part}
+    unwritable = ", ".join(name for name, value in p.items() if value and name not in all_names)
+    raise InputError(f"camera {camera.id!r}: Kalibr has no {unwritable}; adjust the camera without")
 
 
 def mountings_of(
@@ -330,16 +330,16 @@ def mountings_of(
     # One image of every camera, as a file of cameras is read, is a moment too.
     if not moments and len(images) == number:
         moments = {0: list(range(number))}
-    whole = [
+    complete_rigs = [
         rows
         for rows in moments.values()
         if len({*images.camera[rows].tolist()}) == number == len(rows)
     ]
-    if not whole or not np.isfinite(images.position[whole[0]]).all():
+    if not complete_rigs or not np.isfinite(images.position[complete_rigs[0]]).all():
         return None
     # Only the orientations that are written must be there.
-    need_values(network.replace(images=images.take(np.array(whole[0]))), points=False)
-    rows = np.array(whole[0])[np.argsort(images.camera[whole[0]])]
+    need_values(network.replace(images=images.take(np.array(complete_rigs[0]))), points=False)
+    rows = np.array(complete_rigs[0])[np.argsort(images.camera[complete_rigs[0]])]
     R, t = cv_pose(matrices_of(images.angles[rows]), images.position[rows])
     T = np.tile(np.eye(4), (number - 1, 1, 1))
     T[:, :3, :3] = R[1:] @ R[:-1].transpose(0, 2, 1)
@@ -357,16 +357,16 @@ def _lost_orientations(network: Network) -> int:
 def mounted_losses(names: Callable[[Network], Sequence[str]] | None = None) -> Losses:
     """The losses of a format of cameras and their mountings, whose images have the names of the
     cameras; `names`: other ones that cameras are given."""
-    written = names or (lambda n: [camera.id for camera in n.cameras])
+    names_written = names or (lambda n: [camera.id for camera in n.cameras])
     return losing(
         "pixel sizes of cameras",
         "points",
         partly={
             "orientations of images": _lost_orientations,
             "rigs": lambda n: QUANTITIES["rigs"](n) if mountings_of(n) is None else 0,
-            "names of images": lambda n: len({*n.images.id} - {*written(n)}),
+            "names of images": lambda n: len({*n.images.id} - {*names_written(n)}),
             **(
-                {"names of cameras": lambda n: changed([c.id for c in n.cameras], written(n))}
+                {"names of cameras": lambda n: changed([c.id for c in n.cameras], names_written(n))}
                 if names
                 else {}
             ),

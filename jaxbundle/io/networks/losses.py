@@ -37,10 +37,10 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
         (images, images.angles, "image", "orientation"),
         (object_points, object_points.position, "point", "coordinates"),
     ]
-    for table, values, thing, what in tables[: 3 if points else 2]:
+    for table, values, noun, quantity in tables[: 3 if points else 2]:
         for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
             raise InputError(
-                f"{table.source(row)}: {thing} {table.id[row]!r} has no {what} to be written: "
+                f"{table.source(row)}: {noun} {table.id[row]!r} has no {quantity} to be written: "
                 "convert the result of jaxbundle orient or adjust, which compute what is missing"
             )
 
@@ -130,13 +130,17 @@ def losing(
 ) -> Losses:
     """The losses of a format: `STATISTICS` and the names, without those it keeps; `partly`: counts
     of what is lost only in part."""
-    lost = ({*STATISTICS} - {*keeping}) | {*names, *partly}
+    lost_names = ({*STATISTICS} - {*keeping}) | {*names, *partly}
     unknown = {*names, *partly, *keeping} - QUANTITIES.keys()
     if unknown:
         raise ValueError(f"unknown quantities: {', '.join(sorted(unknown))}")
-    hidden = {part for name in lost if name not in partly for part in PARTS.get(name, ())}
+    hidden = {part for name in lost_names if name not in partly for part in PARTS.get(name, ())}
     return MappingProxyType(
-        {name: partly.get(name, QUANTITIES[name]) for name in QUANTITIES if name in lost - hidden}
+        {
+            name: partly.get(name, QUANTITIES[name])
+            for name in QUANTITIES
+            if name in lost_names - hidden
+        }
     )
 
 
@@ -146,9 +150,9 @@ def describe_losses(network: Network, losses: Losses) -> tuple[str, ...]:
     return tuple(f"{name} ({number})" for name, number in numbers.items() if number)
 
 
-def changed(names: Sequence[str], written: Sequence[object]) -> int:
+def changed(names: Sequence[str], names_written: Sequence[object]) -> int:
     """How many names are written as something else."""
-    return sum(name != str(new) for name, new in zip(names, written, strict=True))
+    return sum(name != str(new) for name, new in zip(names, names_written, strict=True))
 
 
 def written_numbers(ids: Sequence[str]) -> list[int]:
@@ -172,9 +176,9 @@ def check_others_zero(camera: Camera, format: str, coefficients: Sequence[str]) 
     if camera.model not in PIXEL_MODELS:
         raise InputError(f"{where} model {str(camera.model)!r}; convert it with --model opencv")
     p = all_parameters(camera)
-    rest = [name for name, value in p.items() if value and name not in (*CORE, *coefficients)]
-    if rest:
-        raise InputError(f"{where} {', '.join(rest)}; adjust the camera without")
+    not_zero = [name for name, value in p.items() if value and name not in (*CORE, *coefficients)]
+    if not_zero:
+        raise InputError(f"{where} {', '.join(not_zero)}; adjust the camera without")
     return p
 
 

@@ -126,34 +126,42 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     unknown = UnknownKeys()
-    chunk, ties, said = _chunk(path, unknown)
+    chunk, ties, messages = _chunk(path, unknown)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     cameras = [camera for camera in chunk.iterfind("cameras//camera")]
     for camera in cameras:
         unknown.check_element(camera, CAMERA_KEYS, f"{path}, camera {label_of(camera)!r}")
-    used = [c for c in cameras if _true(c.get("enabled")) and c.find("transform") is not None]
-    aligned = bool(used)
+    used_cameras = [
+        c for c in cameras if _true(c.get("enabled")) and c.find("transform") is not None
+    ]
+    aligned = bool(used_cameras)
     if not aligned:
-        seen = {e.get("camera_id") for e in chunk.iterfind("frames/frame/markers/marker/location")}
-        used = [c for c in cameras if _true(c.get("enabled")) and c.get("id") in seen]
-    if not used:
+        marked_cameras = {
+            e.get("camera_id") for e in chunk.iterfind("frames/frame/markers/marker/location")
+        }
+        used_cameras = [
+            c for c in cameras if _true(c.get("enabled")) and c.get("id") in marked_cameras
+        ]
+    if not used_cameras:
         raise InputError(
             f"{path}: cameras of Metashape before their alignment: no camera is enabled and "
             "aligned, and none has a measured marker; expected cameras with a <transform>, or "
             "markers with locations"
         )
-    left = [label_of(c) for c in cameras if c not in used]
-    for id in dict.fromkeys(camera.get("sensor_id") for camera in used):
+    left_out = [label_of(c) for c in cameras if c not in used_cameras]
+    for id in dict.fromkeys(camera.get("sensor_id") for camera in used_cameras):
         if id in sensors:
             where = f"{path}, sensor {label_of(sensors[id])!r}"
             check_sensor(unknown, sensors[id], where)
-    entries, told = _entries(path, sensors, used)
-    told = [*said, *told]
-    used = [camera for camera in used if camera.get("sensor_id") in entries]
-    labels = unique_labels([label_of(c) for c in used], [c.get("id", "") for c in used])
+    entries, all_messages = _entries(path, sensors, used_cameras)
+    all_messages = [*messages, *all_messages]
+    used_cameras = [camera for camera in used_cameras if camera.get("sensor_id") in entries]
+    labels = unique_labels(
+        [label_of(c) for c in used_cameras], [c.get("id", "") for c in used_cameras]
+    )
     poses = [
         _pose(f"{path}, camera {label!r}", camera, chunk) if aligned else UNKNOWN_POSE
-        for label, camera in zip(labels, used)
+        for label, camera in zip(labels, used_cameras)
     ]
     names = unique_labels([e["id"] for e in entries.values()], list(entries))
     for entry, name in zip(entries.values(), names):
@@ -162,58 +170,60 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     images = image_columns(
         Source(str(path), None, "camera"),
         labels,
-        [entries[c.get("sensor_id")]["id"] for c in used],
+        [entries[c.get("sensor_id")]["id"] for c in used_cameras],
         M,
         X0,
     )
-    by_id = {c.get("id"): label for c, label in zip(used, labels)}
+    by_id = {c.get("id"): label for c, label in zip(used_cameras, labels)}
     points, rays, control = _markers(path, chunk, by_id)
     if ties is not None:
         points, rays = _with_ties(path, chunk, ties, by_id, points, rays)
     document = foreign_document(path.stem, entries.values(), object_unit="m")
-    if left:
+    if left_out:
         why = "not aligned" if aligned else "without a measured marker"
-        what = f"left out {count(len(left), 'camera')} that are disabled or {why}"
-        told.append(f"{what}: {list_some(left)}")
+        subject = f"left out {count(len(left_out), 'camera')} that are disabled or {why}"
+        all_messages.append(f"{subject}: {list_some(left_out)}")
     network = assemble(path, document, overrides, images, points, rays)
     if control is not None:
         network = with_control(network, control, datum=not choose_datum(overrides))
     if not aligned:
-        told.append("the cameras are not aligned: orientations and coordinates are computed")
-    return network.warn(*told, *_about_references(chunk, control), *unknown.messages())
+        all_messages.append(
+            "the cameras are not aligned: orientations and coordinates are computed"
+        )
+    return network.warn(*all_messages, *_about_references(chunk, control), *unknown.messages())
 
 
 def _entries(
-    path: Path, sensors: Mapping[str | None, ET.Element], used: Sequence[ET.Element]
+    path: Path, sensors: Mapping[str | None, ET.Element], used_cameras: Sequence[ET.Element]
 ) -> tuple[dict[str | None, dict[str, Any]], list[str]]:
     """The entries of the sensors of the photographs, by id, and messages about them."""
-    entries, told, refused = {}, [], {}
-    for camera in used:
+    entries, messages, refusals = {}, [], {}
+    for camera in used_cameras:
         id = camera.get("sensor_id")
         if id not in sensors:
             raise InputError(
                 f"{path}, camera {label_of(camera)!r}: sensor {id!r} is not in the file"
             )
-        if id in entries or id in refused:
+        if id in entries or id in refusals:
             continue
         try:
-            entries[id], more = sensor_camera(path, sensors[id])
-            told += more
+            entries[id], sensor_messages = sensor_camera(path, sensors[id])
+            messages += sensor_messages
         except NoPlaceError as error:
-            refused[id] = error
-    for id, error in refused.items():
+            refusals[id] = error
+    for id, error in refusals.items():
         if not entries:
             raise error
-        lost = [label_of(c) for c in used if c.get("sensor_id") == id]
+        left_out = [label_of(c) for c in used_cameras if c.get("sensor_id") == id]
         why = str(error).removeprefix(f"{path}, ")
-        told.append(f"{why}; left out {count(len(lost), 'camera')}: {list_some(lost)}")
-    return entries, told
+        messages.append(f"{why}; left out {count(len(left_out), 'camera')}: {list_some(left_out)}")
+    return entries, messages
 
 
 def _chunk(path: Path, unknown: UnknownKeys) -> ChunkArchive:
     """The chunk; of a project with its tie points, and messages."""
     if is_metashape_archive(path):
-        found = read_archive(path)
+        archive = read_archive(path)
     else:
         root = read_xml(path)
         chunks = root.findall("chunk")
@@ -222,11 +232,11 @@ def _chunk(path: Path, unknown: UnknownKeys) -> ChunkArchive:
                 f"{path}: expected one <chunk> in a <document>; there are {len(chunks)}"
             )
         unknown.check_element(root, DOCUMENT_KEYS, path)
-        found = ChunkArchive(chunks[0])
-    unknown.check_element(found.chunk, CHUNK_KEYS, path)
-    for marker in found.chunk.iterfind("markers//marker"):
+        archive = ChunkArchive(chunks[0])
+    unknown.check_element(archive.chunk, CHUNK_KEYS, path)
+    for marker in archive.chunk.iterfind("markers//marker"):
         unknown.check_element(marker, MARKER_KEYS, f"{path}, marker {label_of(marker)!r}")
-    return found
+    return archive
 
 
 def _pose(
@@ -273,33 +283,35 @@ def _with_ties(
     and the number of the track); image points of tracks without a point are left out."""
     X = np.empty_like(ties.position)
     for component in dict.fromkeys(ties.component.tolist()):
-        rows = np.array([one == component for one in ties.component.tolist()])
+        rows = np.array([tie_component == component for tie_component in ties.component.tolist()])
         R, t, scale = _to_world(f"{path}, tie points", chunk, component)
         X[rows] = scale * ties.position[rows] @ R.T + t
-    known = np.array([camera in images for camera in ties.camera.tolist()], bool)
-    known &= np.isin(ties.track, ties.id)
-    xy = ties.xy[known] - PIXEL_CENTRE
+    is_known = np.array([camera in images for camera in ties.camera.tolist()], bool)
+    is_known &= np.isin(ties.track, ties.id)
+    xy = ties.xy[is_known] - PIXEL_CENTRE
     names = [f"t{id}" for id in ties.id.tolist()]
-    made = {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", X.T))}
-    made |= colour_columns(ties.colour)
-    seen = {
-        "image": [images[camera] for camera in ties.camera[known].tolist()],
-        "point": [f"t{id}" for id in ties.track[known].tolist()],
+    points_made = {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", X.T))}
+    points_made |= colour_columns(ties.colour)
+    rays_made = {
+        "image": [images[camera] for camera in ties.camera[is_known].tolist()],
+        "point": [f"t{id}" for id in ties.track[is_known].tolist()],
         "x": xy[:, 0],
         "y": xy[:, 1],
     }
-    return _joined(points, made, path), _joined(rays, seen, path)
+    return _join_columns(points, points_made, path), _join_columns(rays, rays_made, path)
 
 
-def _joined(first: Columns | None, more: Mapping[str, Any], path: Path) -> Columns:
+def _join_columns(
+    first_table: Columns | None, further_columns: Mapping[str, Any], path: Path
+) -> Columns:
     """The rows of a table, followed by others; columns that the first does not have are empty
     there."""
-    if first is None:
-        return Columns(dict(more), Source(str(path), None, "tie point"))
+    if first_table is None:
+        return Columns(dict(further_columns), Source(str(path), None, "tie point"))
     return Columns(
         {
-            name: [*first.values.get(name, [None] * len(first)), *column]
-            for name, column in more.items()
+            name: [*first_table.values.get(name, [None] * len(first_table)), *column]
+            for name, column in further_columns.items()
         },
         Source(str(path), None, "point"),
     )
@@ -310,7 +322,7 @@ def _markers(
 ) -> tuple[Columns | None, Columns | None, Points | None]:
     """Tables of points and image points of markers, and control points; each may be None."""
     markers = {m.get("id"): m for m in chunk.iterfind("markers//marker")}
-    rows, seen = [], {}
+    rows, marker_ids = [], {}
     for marker in chunk.iterfind("frames/frame/markers/marker"):
         id = marker.get("marker_id")
         if id not in markers:
@@ -322,21 +334,26 @@ def _markers(
             x, y = (number_in(location.get(k, ""), f"{where}, {k}") for k in "xy")
             image = images[location.get("camera_id")]
             rows.append((image, id, x - PIXEL_CENTRE, y - PIXEL_CENTRE))
-            seen[id] = None
+            marker_ids[id] = None
     if not rows:
         return None, None, None
     # Labels may repeat, ids may not.
-    names = dict(zip(seen, unique_labels([label_of(markers[id]) for id in seen], list(seen))))
-    none = [None] * len(seen)
+    names = dict(
+        zip(
+            marker_ids,
+            unique_labels([label_of(markers[id]) for id in marker_ids], list(marker_ids)),
+        )
+    )
+    blank = [None] * len(marker_ids)
     image, point, x, y = zip(*rows)
     return (
         Columns(
             {
                 "id": list(names.values()),
-                "role": ["tie"] * len(seen),
-                "X": none,
-                "Y": none,
-                "Z": none,
+                "role": ["tie"] * len(marker_ids),
+                "X": blank,
+                "Y": blank,
+                "Z": blank,
             },
             Source(str(path), None, "marker"),
         ),
@@ -344,7 +361,7 @@ def _markers(
             {"image": image, "point": [names[id] for id in point], "x": x, "y": y},
             Source(str(path), None, "location"),
         ),
-        _references(path, chunk, {names[id]: markers[id] for id in seen}),
+        _references(path, chunk, {names[id]: markers[id] for id in marker_ids}),
     )
 
 

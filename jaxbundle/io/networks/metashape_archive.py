@@ -76,35 +76,36 @@ def read_archive(path: Path) -> ChunkArchive:
     chunks = {chunk.get("id"): chunk.get("path") for chunk in document.iterfind("chunks/chunk")}
     holder = document.find("chunks")
     active = None if holder is None else holder.get("active_id")
-    chosen = active if active in chunks else next(iter(chunks), None)
-    if not chunks.get(chosen):
+    active_chunk = active if active in chunks else next(iter(chunks), None)
+    if not chunks.get(active_chunk):
         raise InputError(f"{project}: {PROJECT} without a chunk")
-    told = []
+    messages = []
     if len(chunks) > 1:
-        others = [id or "?" for id in chunks if id != chosen]
-        told.append(
-            f"chunk {chosen}, the active one, is read; not read: {list_some(others, as_text=str)}"
+        other_chunks = [id or "?" for id in chunks if id != active_chunk]
+        messages.append(
+            f"chunk {active_chunk}, the active one, is read; not read: "
+            f"{list_some(other_chunks, as_text=str)}"
         )
-    archive = project.parent / str(chunks[chosen])
+    archive = project.parent / str(chunks[active_chunk])
     # Its frames are changed below.
     chunk = copy.deepcopy(document_of(archive, _members(archive, path), PROJECT))
     if chunk.tag != "chunk":
         raise InputError(f"{archive}: expected <chunk> in its doc.xml, got <{chunk.tag}>")
     frames = chunk.findall("frames/frame")
     if len(frames) > 1:
-        told.append(f"the first of {len(frames)} frames is read")
+        messages.append(f"the first of {len(frames)} frames is read")
     ties = None
     holder = chunk.find("frames")
     for frame in frames[1:]:
         if holder is not None:
             holder.remove(frame)
     if frames and frames[0].get("path"):
-        inside = archive.parent / str(frames[0].get("path"))
-        found = document_of(inside, _members(inside, path), PROJECT)
+        frame_file = archive.parent / str(frames[0].get("path"))
+        frame_document = document_of(frame_file, _members(frame_file, path), PROJECT)
         # As an export has it: the markers with their image points.
-        frames[0].extend(found.findall("markers"))
-        ties = _ties(inside.parent / "point_cloud" / "point_cloud.zip", path)
-    return ChunkArchive(chunk, ties, tuple(told))
+        frames[0].extend(frame_document.findall("markers"))
+        ties = _ties(frame_file.parent / "point_cloud" / "point_cloud.zip", path)
+    return ChunkArchive(chunk, ties, tuple(messages))
 
 
 def _members(archive: Path, project: Path) -> Mapping[str, bytes]:
@@ -142,9 +143,9 @@ def _ties(archive: Path, project: Path) -> TieTable | None:
     entry = document.find("tracks")
     if entry is not None and entry.get("path") in members:
         table = _vertices(archive, members, entry, ("red", "green", "blue"))
-        known = (ids >= 0) & (ids < len(table))
+        is_known = (ids >= 0) & (ids < len(table))
         for axis, name in enumerate(("red", "green", "blue")):
-            colour[known, axis] = table[name][ids[known]]
+            colour[is_known, axis] = table[name][ids[is_known]]
     return TieTable(
         ids,
         np.concatenate(component),

@@ -111,12 +111,14 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
     decentred = p["p1"] != 0 or p["p2"] != 0  # p3 and p4 are factors of these terms
     if kind == "frame":
         values |= {"p1": p["p2"], "p2": p["p1"]}
-        rest = {name: p[name] for name in ("k4", "b2", *(("p3", "p4") if decentred else ()))}
+        other_parameters = {
+            name: p[name] for name in ("k4", "b2", *(("p3", "p4") if decentred else ()))
+        }
     else:
         values |= {"k4": p["k4"]}
-        rest = {name: p[name] for name in ("p1", "p2", "b2")}
-    rest = {name: value for name, value in rest.items() if value != 0}
-    if not rest and "equisolid" not in kind:
+        other_parameters = {name: p[name] for name in ("p1", "p2", "b2")}
+    other_parameters = {name: value for name, value in other_parameters.items() if value != 0}
+    if not other_parameters and "equisolid" not in kind:
         return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, ()
     foreign = Foreign(
         FORMULAS[kind],
@@ -126,10 +128,10 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
         _pixel_size(where, sensor),
         kind != "frame",
     )
-    found, fit = nearest_camera(foreign, where)
-    has = "".join(f"{name} {value:g}, " for name, value in rest.items()).rstrip(", ")
+    fitted_entry, fit = nearest_camera(foreign, where)
+    has = "".join(f"{name} {value:g}, " for name, value in other_parameters.items()).rstrip(", ")
     why = f"has {has}" if has else "is equisolid"
-    return entry | found, (f"sensor {label!r} {why}: {fit}",)
+    return entry | fitted_entry, (f"sensor {label!r} {why}: {fit}",)
 
 
 def _sphere(where: str, label: str, sensor: ET.Element) -> dict[str, Any]:
@@ -226,16 +228,16 @@ def _project_metashape(
     if kind == "frame":
         x, y = X / Z, Y / Z
     else:
-        off = root(X * X + Y * Y)
-        angle = jnp.arctan2(off, Z)
+        radius = root(X * X + Y * Y)
+        angle = jnp.arctan2(radius, Z)
         length = 2 * jnp.sin(angle / 2) if "equisolid" in kind else angle
-        scale = jnp.where(off > 0, length / jnp.where(off > 0, off, 1.0), 1.0)
+        scale = jnp.where(radius > 0, length / jnp.where(radius > 0, radius, 1.0), 1.0)
         x, y = X * scale, Y * scale
     r2 = x * x + y * y
     radial = 1 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * (p["k3"] + r2 * p["k4"])))
-    more = 1 + r2 * (p["p3"] + r2 * p["p4"])
-    xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * more
-    yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * more
+    higher_order = 1 + r2 * (p["p3"] + r2 * p["p4"])
+    xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * higher_order
+    yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * higher_order
     u = p["w"] / 2 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"]
     return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - PIXEL_CENTRE
 

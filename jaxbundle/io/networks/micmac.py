@@ -76,7 +76,7 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if not files:
         raise InputError(f"{path}: there is no {FILES[0]} in it")
     cameras: dict[Path, Camera] = {}
-    names, used, rotations, centres = [], [], [], []
+    names, camera_of_image, rotations, centres = [], [], [], []
     unknown = UnknownKeys()
     for file in files:
         xml = XmlFields(file, read_xml(file), "an orientation of MicMac")
@@ -90,19 +90,19 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             cameras[where] = calibration(where, root, id)
         C2W, X0 = _pose(xml)
         names.append(file.stem.removeprefix(ORIENTATION))
-        used.append(cameras[where].id)
+        camera_of_image.append(cameras[where].id)
         rotations.append(C2W.T)  # world → camera, as R of x = R·X + t
         centres.append(X0)
     images = image_columns(
         Source(str(path), None, "file"),
         names,
-        used,
+        camera_of_image,
         flip_rows(np.array(rotations)),
         np.array(centres),
     )
-    made = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
-    told = (*fit_messages(cameras.values()), *unknown.messages())
-    return assemble(path, made, overrides, images, warnings=told)
+    network_document = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
+    messages = (*fit_messages(cameras.values()), *unknown.messages())
+    return assemble(path, network_document, overrides, images, warnings=messages)
 
 
 def _calibration(file: Path, xml: XmlFields) -> tuple[Path, ET.Element]:
@@ -125,21 +125,21 @@ def _pose(xml: XmlFields) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
     external = xml.find("Externe")
     if external is None:
         raise xml.missing("Externe")
-    own = XmlFields(xml.path, external, xml.kind)
-    convention = own.text("KnownConv", xml.text("ConvOri/KnownConv", M2C[0]))
-    for name, value, known in (
+    external_orientation = XmlFields(xml.path, external, xml.kind)
+    convention = external_orientation.text("KnownConv", xml.text("ConvOri/KnownConv", M2C[0]))
+    for name, value, supported in (
         ("TypeProj", kind, ("eProjStenope",)),
         ("KnownConv", convention, (*M2C, *C2M)),
     ):
-        if value not in known:
-            raise InputError(f"{xml.path}: {name} is {value}; expected {', '.join(known)}")
+        if value not in supported:
+            raise InputError(f"{xml.path}: {name} is {value}; expected {', '.join(supported)}")
     if xml.find("OrIntImaM2C") is not None:
-        for name, wanted in IDENTITY.items():
-            if tuple(xml.numbers(f"OrIntImaM2C/{name}", 2)) != wanted:
+        for name, expected in IDENTITY.items():
+            if tuple(xml.numbers(f"OrIntImaM2C/{name}", 2)) != expected:
                 raise InputError(f"{xml.path}: OrIntImaM2C must be the identity, but {name} is not")
-    rows = [own.numbers(f"ParamRotation/CodageMatr/L{i}", 3) for i in (1, 2, 3)]
+    rows = [external_orientation.numbers(f"ParamRotation/CodageMatr/L{i}", 3) for i in (1, 2, 3)]
     check_rotations(np.array(rows), f"{xml.path}: CodageMatr")
-    return np.array(rows), own.numbers("Centre", 3)
+    return np.array(rows), external_orientation.numbers("Centre", 3)
 
 
 def write_micmac(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:

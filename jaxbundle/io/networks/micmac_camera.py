@@ -104,23 +104,25 @@ def calibration(path: Path, root: ET.Element, id: str, pixel_size: float = 0.005
     **Arguments:** `pixel_size` [mm] of a model in mm, since the file has none. Any value gives the
     same image; 5 µm is a common one, so that c in mm looks like that of a lens.
     """
-    whole = XmlFields(path, root, "a calibration of MicMac")
+    document_fields = XmlFields(path, root, "a calibration of MicMac")
     # Tapas writes it inside <ExportAPERO>, other tools as the root
-    found = root if root.tag == CALIBRATION else whole.find(CALIBRATION)
-    if found is None:
-        raise whole.missing(CALIBRATION)
-    xml = XmlFields(path, found, "a calibration of MicMac")
+    calibration_element = root if root.tag == CALIBRATION else document_fields.find(CALIBRATION)
+    if calibration_element is None:
+        raise document_fields.missing(CALIBRATION)
+    xml = XmlFields(path, calibration_element, "a calibration of MicMac")
     unknown = UnknownKeys()
-    _check_keys(unknown, path, found)
+    _check_keys(unknown, path, calibration_element)
     camera = _calibrated(path, xml, id, pixel_size)
     return with_messages(camera, *unknown.messages())
 
 
-def _check_keys(unknown: UnknownKeys, path: Path, found: ET.Element) -> None:
-    unknown.check_element(found, KEYS, f"{path}: {CALIBRATION}")
-    if any(float(e.text or 0) for e in found.iter("ParamAF") if is_number(e.text or "")):
+def _check_keys(unknown: UnknownKeys, path: Path, calibration_element: ET.Element) -> None:
+    unknown.check_element(calibration_element, KEYS, f"{path}: {CALIBRATION}")
+    if any(
+        float(e.text or 0) for e in calibration_element.iter("ParamAF") if is_number(e.text or "")
+    ):
         raise InputError(f"{path}: ParamAF, an afocal system, is not supported")
-    for distortion in found.iter("CalibDistortion"):
+    for distortion in calibration_element.iter("CalibDistortion"):
         unknown.check_element(distortion, DISTORTION_KEYS, f"{path}: CalibDistortion")
         for tag, keys in KIND_KEYS.items():
             for part in distortion.iter(tag):
@@ -130,8 +132,8 @@ def _check_keys(unknown: UnknownKeys, path: Path, found: ET.Element) -> None:
 def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camera:
     direction = xml.text("KnownConv", M2C[0])
     if direction not in (*M2C, *C2M):
-        known = ", ".join((*M2C, *C2M))
-        raise InputError(f"{path}: KnownConv is {direction}; expected one of {known}")
+        known_directions = ", ".join((*M2C, *C2M))
+        raise InputError(f"{path}: KnownConv is {direction}; expected one of {known_directions}")
     if xml.find("OrIntGlob") is not None:
         raise InputError(f"{path}: OrIntGlob, a separate affine part, is not supported")
     f, (cx, cy), (w, h) = xml.number("F"), xml.numbers("PP", 2), xml.numbers("SzIm", 2)
@@ -154,7 +156,7 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
         # Equal to the last bit: MicMac writes one number twice (PPaEqPPs).
         "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"]),
     }
-    has = " and ".join(what for what, there in odd.items() if there)
+    has = " and ".join(feature for feature, is_there in odd.items() if is_there)
     size = int(w), int(h)
     if has:
         foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (pixel_size, pixel_size))
@@ -162,14 +164,18 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     # Without affinity, or any distortion of the other direction, the formulas are the same.
     if not (p["b1"] or p["b2"] or (direction in C2M and any(p[name] for name in COEFFICIENTS))):
         return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
-    model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {pixel_size:g} mm"
+    model, pixel_size_words = (
+        MODELS[1 + (direction in C2M)],
+        f"the pixel size is taken as {pixel_size:g} mm",
+    )
     return FittedCamera(
         id,
         model,
         _in_mm(p, size, pixel_size),
         image_size=size,
         pixel_size=(pixel_size, pixel_size),
-        told=f"camera {id!r} is {model}, which is in mm: {told}; in pixels it changes nothing",
+        told=f"camera {id!r} is {model}, which is in mm: {pixel_size_words}; in pixels it changes "
+        "nothing",
     )
 
 
@@ -193,7 +199,7 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
     """R1 … R5, the centre x, y, and P1, P2, b1, b2, of the only distortion other than ModNoDist.
 
     **Raises:** `InputError` for an unsupported kind, and for several."""
-    none = dict.fromkeys(COEFFICIENTS, 0.0)
+    no_distortion = dict.fromkeys(COEFFICIENTS, 0.0)
     kinds = [kind for part in xml.root.iter("CalibDistortion") for kind in part]
     kinds = [kind for kind in kinds if kind.tag != "ModNoDist"]
     for kind in kinds:
@@ -204,13 +210,13 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
                 + f" of {len(kinds)}; expected one of ModNoDist, ModRad, ModPhgrStd, ModUnif"
             )
     if not kinds:
-        return none | {"x": core["cx"], "y": core["cy"]}
+        return no_distortion | {"x": core["cx"], "y": core["cy"]}
     part = XmlFields(xml.path, kinds[0], f"a {kinds[0].tag} of MicMac")
     x, y = part.numbers("CDist", 2)
     R = [number_in(e.text or "", f"{xml.path}: CoeffDist") for e in kinds[0].iter("CoeffDist")]
     if any(R[len(RADIAL) :]):
         raise InputError(f"{xml.path}: {len(R)} coefficients CoeffDist; {len(RADIAL)} are known")
-    coefficients = none | dict(zip(RADIAL, R))
+    coefficients = no_distortion | dict(zip(RADIAL, R))
     coefficients |= {name: part.number(name, 0.0) for name in AFFINE}
     return coefficients | {"x": float(x), "y": float(y)}
 

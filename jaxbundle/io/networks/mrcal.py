@@ -154,17 +154,19 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     size = fields.array("imagersize", (2,))
     sizes = JsonFields(f"{fields.path}: imagersize", dict(zip("wh", size.tolist())))
     w, h = sizes.integer("w", least=1), sizes.integer("h", least=1)
-    model, more = MODELS.get(kind, ("", CAHVOR if kind == "CAHVOR" else None))
+    model, coefficients = MODELS.get(kind, ("", CAHVOR if kind == "CAHVOR" else None))
     if knots := SPLINE.fullmatch(kind):
         model = "spline-{}x{}-{}".format(*knots.groups())
-        more = model_of(model, f"{fields.path}: lensmodel {name[:80]}: ").parameters[len(CORE) :]
-    if more is None:
+        coefficients = model_of(model, f"{fields.path}: lensmodel {name[:80]}: ").parameters[
+            len(CORE) :
+        ]
+    if coefficients is None:
         raise InputError(
             f"{fields.path}: lensmodel {name} is not offered here; these are: "
             f"{', '.join(MODELS)}, CAHVOR, SPLINED_STEREOGRAPHIC_order=3_…"
         )
-    values = fields.array("intrinsics", (len(CORE) + len(more),)).tolist()
-    p = dict(zip((*CORE, *more), values))
+    values = fields.array("intrinsics", (len(CORE) + len(coefficients),)).tolist()
+    p = dict(zip((*CORE, *coefficients), values))
     if model:
         return Camera(id, model, p, image_size=(w, h))
     s = 1 + p["r0"]
@@ -194,10 +196,10 @@ def cahvor(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Ar
     a, b = p["alpha"], p["beta"]
     o = jnp.stack([jnp.sin(a) * jnp.cos(b), jnp.sin(b), jnp.cos(a) * jnp.cos(b)])
     ray = jnp.stack([X, Y, Z])
-    along = ray @ o
-    off = ray - along * o
-    tau = (off @ off) / along**2
-    x, y, z = ray + (p["r0"] + tau * (p["r1"] + tau * p["r2"])) * off
+    depth = ray @ o
+    off_axis = ray - depth * o
+    tau = (off_axis @ off_axis) / depth**2
+    x, y, z = ray + (p["r0"] + tau * (p["r1"] + tau * p["r2"])) * off_axis
     return jnp.stack([p["fx"] * x / z + p["cx"], p["fy"] * y / z + p["cy"]])
 
 
@@ -207,7 +209,11 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
     **Raises:** `InputError` for a camera without a model in mrcal, or without image size.
     """
     p, (w, h) = all_parameters(camera), size_of(camera, "mrcal")
-    kinds = {kind: more for kind, (model, more) in MODELS.items() if model == camera.model}
+    kinds = {
+        kind: coefficients
+        for kind, (model, coefficients) in MODELS.items()
+        if model == camera.model
+    }
     if knots := OUR_SPLINE.fullmatch(str(camera.model)):
         kind = "SPLINED_STEREOGRAPHIC_order=3_Nx={}_Ny={}_fov_x_deg={}".format(*knots.groups())
         kinds = {kind: tuple(p)[len(CORE) :]}
@@ -218,8 +224,8 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
         )
     kind = next(
         kind
-        for kind, more in kinds.items()
-        if not any(p[name] for name in p if name not in (*CORE, *more))
+        for kind, coefficients in kinds.items()
+        if not any(p[name] for name in p if name not in (*CORE, *coefficients))
     )
     numbers = lambda values: f"[ {join_numbers(values, ', ')} ]"
     return (

@@ -91,11 +91,13 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if not models:
         raise InputError(f"{path}: there is no model in it; expected a number of cameras")
     model = max(models, key=lambda model: (len(model.points), len(model.cameras)))
-    told = [f"the largest of {len(models)} models is read"] if len(models) > 1 else []
-    return _network(path, model, overrides, told)
+    messages = [f"the largest of {len(models)} models is read"] if len(models) > 1 else []
+    return _network(path, model, overrides, messages)
 
 
-def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence[str]) -> Network:
+def _network(
+    path: Path, model: _Model, overrides: Sequence[str], messages: Sequence[str]
+) -> Network:
     names, values, lines = [], [], []
     for row in model.cameras:
         # A name may have blanks; ten numbers follow it.
@@ -122,21 +124,25 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
         for name, f, r in zip(names, c.tolist(), p[:, 8].tolist())
     ]
     position, colours, rays = _points(model, len(names))
-    kept = {}
+    first_rows = {}
     for k, (image, point, *_) in enumerate(rays[:, :2].astype(np.int64).tolist()):
-        kept.setdefault((image, point), k)
-    if len(kept) < len(rays):
-        what = count(len(rays) - len(kept), "image point")
-        told = [*told, f"left out {what} of object points that have another in the same image"]
-        rays = rays[list(kept.values())]
+        first_rows.setdefault((image, point), k)
+    if len(first_rows) < len(rays):
+        subject = count(len(rays) - len(first_rows), "image point")
+        messages = [
+            *messages,
+            f"left out {subject} of object points that have another in the same image",
+        ]
+        rays = rays[list(first_rows.values())]
     source = Source(str(path), rays[:, 4].astype(np.int64), "line")
     offset = _offset_of_centre(rays, position, M, p)
     if offset.any():
-        at = ", ".join(f"{x:.2f}" for x in np.median(offset, axis=0))
-        told = [
-            *told,
+        median_offset = ", ".join(f"{x:.2f}" for x in np.median(offset, axis=0))
+        messages = [
+            *messages,
             "image points are counted from a corner of the images, as other programs than "
-            f"VisualSFM write them: their centres, ({at}) px, are where the points fit best",
+            f"VisualSFM write them: their centres, ({median_offset}) px, are where the points fit "
+            "best",
         ]
     xy = (rays[:, 2:4] - offset[rays[:, 0].astype(np.int64)]) * [PIXEL, -PIXEL]
     return assemble(
@@ -155,7 +161,7 @@ def _network(path: Path, model: _Model, overrides: Sequence[str], told: Sequence
              **dict.fromkeys(("sx", "sy"), np.full(len(xy), PIXEL))},
             source,
         ),
-        told,
+        messages,
     )  # fmt: skip
 
 
@@ -164,27 +170,31 @@ def _offset_of_centre(
     position: Float[np.ndarray, "points 3"],
     M: Float[np.ndarray, "images 3 3"],
     p: Float[np.ndarray, "images 9"],
-    spread: float = 0.1,
+    tolerance: float = 0.1,
 ) -> Float[np.ndarray, "images 2"]:
     """Where the centre of the images is, px; 0 where image points count from it.
 
-    **Arguments:** `spread`: relative to the image; the offset is half an image or none. Offsets of
-    images that differ by less are one, those of images of other sizes differ by more.
-    """
-    none, xy = np.zeros((len(p), 2)), rays[:, 2:4]
+    **Arguments:** `tolerance`: relative to the image; the offset is half an image or none. Offsets
+    of images that differ by less are one, those of images of other sizes differ by more."""
+    no_offset, xy = np.zeros((len(p), 2)), rays[:, 2:4]
     if not len(xy) or xy.min() < 0:
-        return none
+        return no_offset
     image, point = rays[:, :2].astype(np.int64).T
     r, s, q = np.einsum("nij,nj->in", M[image], position[point] - p[image, 5:8])
     with np.errstate(divide="ignore", invalid="ignore"):
-        off = xy - p[image, :1] * np.stack([-r / q, s / q], 1)
-    off[~np.isfinite(off).all(1)] = np.nan
-    if np.isnan(off).all() or (whole := np.nanmedian(off, axis=0)).min() < spread * xy.max():
-        return none
-    own = [off[image == k] for k in range(len(p))]
-    own = [whole if np.isnan(rows).all() else np.nanmedian(rows, axis=0) for rows in own]
-    far = (np.abs(own - whole) > spread * xy.max()).any()
-    return np.array(own) if far else none + whole
+        misclosure = xy - p[image, :1] * np.stack([-r / q, s / q], 1)
+    misclosure[~np.isfinite(misclosure).all(1)] = np.nan
+    if (
+        np.isnan(misclosure).all()
+        or (median_of_all := np.nanmedian(misclosure, axis=0)).min() < tolerance * xy.max()
+    ):
+        return no_offset
+    by_image = [misclosure[image == k] for k in range(len(p))]
+    by_image = [
+        median_of_all if np.isnan(rows).all() else np.nanmedian(rows, axis=0) for rows in by_image
+    ]
+    is_far = (np.abs(by_image - median_of_all) > tolerance * xy.max()).any()
+    return np.array(by_image) if is_far else no_offset + median_of_all
 
 
 def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -193,8 +203,8 @@ def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     for k, row in enumerate(model.points):
         numbers = row.all_numbers("a point")
         views = row.rays(6, "a point", images, "image")
-        rest = np.ones((len(views), 1))
+        ones = np.ones((len(views), 1))
         position.append(numbers[:6])
-        rays.append(np.hstack([views[:, :1], k * rest, views[:, 2:], row.number * rest]))
+        rays.append(np.hstack([views[:, :1], k * ones, views[:, 2:], row.number * ones]))
     values = np.reshape(position, (-1, 6))
     return values[:, :3], values[:, 3:], np.concatenate(rays)

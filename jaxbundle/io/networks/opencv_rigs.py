@@ -87,11 +87,11 @@ def is_opencv_rig(path: Path) -> bool:
     # ORB-SLAM's LEFT.K, RIGHT.K stand beside the camera of the rectified images
     if is_slam_yaml(path):
         return False
-    found = find_cameras(path)
-    if len(found) > 1:
+    cameras_found = find_cameras(path)
+    if len(cameras_found) > 1:
         return True
-    if found and found[0][1]:
-        return _sides(found[0][1]) is not None  # {K: …, K1: …} is none
+    if cameras_found and cameras_found[0][1]:
+        return _sides(cameras_found[0][1]) is not None  # {K: …, K1: …} is none
     return _is_pair(path)
 
 
@@ -156,36 +156,36 @@ def read_opencv_rig(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         cameras, poses = _read_pair(path, document, pair, unknown)
     else:
         cameras, poses = _read_nested(path, document, unknown)
-    told = (*fit_messages(cameras), *unknown.messages())
-    return rig_network(path, cameras, *zip(*poses), overrides, told)  # type: ignore[arg-type]
+    messages = (*fit_messages(cameras), *unknown.messages())
+    return rig_network(path, cameras, *zip(*poses), overrides, messages)  # type: ignore[arg-type]
 
 
 def _read_pair(
     path: Path, document: Mapping[str, Any], pair: tuple[str, str], unknown: UnknownKeys
 ) -> tuple[list[Camera], list[CameraFromRig]]:
     """Two cameras whose entries are told apart by their names."""
-    own: list[dict[str, Any]] = [{}, {}]
-    rest: dict[str, Any] = {}
+    entries_by_side: list[dict[str, Any]] = [{}, {}]
+    other_entries: dict[str, Any] = {}
     for name, value in document.items():
         sides = [_of_side(name, value, side) for side in pair]
         # `distCoeffsL`: of one side; `R1`, `P1`: of the rectification
         if fold(name) in POSES or meaning_of(name, value) in SHARED or not any(sides):
-            rest[name] = value
+            other_entries[name] = value
         else:
-            own[sides.index(next(filter(None, sides)))][name] = value
-    shared = camera_entries({k: v for k, v in rest.items() if meaning_of(k, v) in SHARED}, path,
-                            unknown)  # fmt: skip
-    left = {k: v for k, v in rest.items() if meaning_of(k, v) not in SHARED}
-    pose = _take_pose(path, left)
-    folded = {fold(name): name for name in left}
+            entries_by_side[sides.index(next(filter(None, sides)))][name] = value
+    of_both = {k: v for k, v in other_entries.items() if meaning_of(k, v) in SHARED}
+    shared = camera_entries(of_both, path, unknown)
+    unused = {k: v for k, v in other_entries.items() if meaning_of(k, v) not in SHARED}
+    pose = _take_pose(path, unused)
+    folded = {fold(name): name for name in unused}
     unknown.check((folded[name] for name in RECTIFIED.unknown(folded)), Keys(POSES), path)
     cameras = []
-    for k, (side, entries) in enumerate(zip(pair, own)):
-        found: Found = dict(shared)
+    for k, (side, entries) in enumerate(zip(pair, entries_by_side)):
+        by_meaning: Found = dict(shared)
         for name, value in entries.items():
-            found[str(_of_side(name, value, side))] = (name, value)
-        id = found.pop("camera_name", ("", side if len(side) > 1 else ("left", "right")[k]))[1]
-        cameras.append(camera_of(path, found, str(id)))
+            by_meaning[str(_of_side(name, value, side))] = (name, value)
+        id = by_meaning.pop("camera_name", ("", side if len(side) > 1 else ("left", "right")[k]))[1]
+        cameras.append(camera_of(path, by_meaning, str(id)))
     return cameras, [CameraFromRig(np.eye(3), np.zeros(3)), pose or CameraFromRig(*UNKNOWN)]
 
 
@@ -193,41 +193,51 @@ def _read_nested(
     path: Path, document: Any, unknown: UnknownKeys
 ) -> tuple[list[Camera], list[CameraFromRig]]:
     """Cameras that are objects of their own."""
-    inside = list(cameras_within(document))
-    if len(inside) < 2:
-        raise InputError(f"{path}: {count(len(inside), 'camera')} in it; expected two or more")
+    nested_cameras = list(cameras_within(document))
+    if len(nested_cameras) < 2:
+        raise InputError(
+            f"{path}: {count(len(nested_cameras), 'camera')} in it; expected two or more"
+        )
     cameras, poses = [], []
-    for k, (name, entries) in enumerate(inside):
-        where, own = f"{path}, {name}", dict(entries)
-        poses.append(_take_pose(where, own))
-        found = camera_entries(own, where, unknown)
-        id = str(found.get("camera_name", ("", name or k))[1])
-        cameras.append(camera_of(where, found, id))
+    for k, (name, entries) in enumerate(nested_cameras):
+        where, entries_of_camera = f"{path}, {name}", dict(entries)
+        poses.append(_take_pose(where, entries_of_camera))
+        by_meaning = camera_entries(entries_of_camera, where, unknown)
+        id = str(by_meaning.get("camera_name", ("", name or k))[1])
+        cameras.append(camera_of(where, by_meaning, id))
     ids = [camera.id for camera in cameras]
     if len({*ids}) < len(ids):
-        names = unique_labels([name for name, _ in inside], range(len(inside)))
+        names = unique_labels([name for name, _ in nested_cameras], range(len(nested_cameras)))
         cameras = [dataclasses.replace(camera, id=name) for camera, name in zip(cameras, names)]
     if isinstance(document, Mapping):
-        names = {name for name, _ in inside}
-        left = {key: value for key, value in document.items() if key not in names}
-        shared = _take_pose(path, left) if len(inside) == 2 and not any(poses) else None
+        names = {name for name, _ in nested_cameras}
+        other_entries = {key: value for key, value in document.items() if key not in names}
+        shared = (
+            _take_pose(path, other_entries) if len(nested_cameras) == 2 and not any(poses) else None
+        )
         if shared is not None:
             poses = [CameraFromRig(np.eye(3), np.zeros(3)), shared]
-        around = {fold(key): key for key, value in left.items() if not _holds(value, inside)}
-        unknown.check((around[key] for key in RECTIFIED.unknown(around)), Keys(POSES), path)
+        outer_names = {
+            fold(key): key
+            for key, value in other_entries.items()
+            if not _holds(value, nested_cameras)
+        }
+        unknown.check(
+            (outer_names[key] for key in RECTIFIED.unknown(outer_names)), Keys(POSES), path
+        )
     # With the first as reference, which many files leave out.
     if any(poses[1:]) and poses[0] is None:
         poses[0] = CameraFromRig(np.eye(3), np.zeros(3))
     return cameras, [pose or CameraFromRig(*UNKNOWN) for pose in poses]
 
 
-def _holds(value: Any, inside: Sequence[tuple[str, Any]]) -> bool:
+def _holds(value: Any, nested_cameras: Sequence[tuple[str, Any]]) -> bool:
     """Whether a value contains one of the cameras."""
-    if any(value is entries for _, entries in inside):
+    if any(value is entries for _, entries in nested_cameras):
         return True
     parts = value.values() if isinstance(value, Mapping) else value
     return isinstance(value, Mapping | list) and any(
-        _holds(part, inside) for part in parts if isinstance(part, Mapping | list)
+        _holds(part, nested_cameras) for part in parts if isinstance(part, Mapping | list)
     )
 
 
@@ -235,35 +245,40 @@ def _take_pose(where: object, entries: dict[str, Any]) -> CameraFromRig | None:
     """The pose among entries, which are removed; None without one.
 
     **Raises:** `InputError` for half a pose, and what is no rotation."""
-    named = {
+    name_of_kind = {
         POSES[fold(name)]: name
         for name, value in entries.items()
         if fold(name) in POSES and value not in (None, [])
     }
-    taken = {kind: (name, entries.pop(name)) for kind, name in named.items()}
+    taken_entries = {kind: (name, entries.pop(name)) for kind, name in name_of_kind.items()}
     path = str(where)
-    if "pose" in taken and isinstance(taken["pose"][1], Mapping) and "data" not in taken["pose"][1]:
-        return _take_pose(f"{where}, {taken['pose'][0]}", dict(taken["pose"][1]))
-    if "pose" not in taken and "T" in taken and "R" not in taken:
-        taken["pose"] = taken.pop("T")  # T, 4 × 4
-    if "pose" in taken:
-        name, value = taken["pose"]
+    if (
+        "pose" in taken_entries
+        and isinstance(taken_entries["pose"][1], Mapping)
+        and "data" not in taken_entries["pose"][1]
+    ):
+        return _take_pose(f"{where}, {taken_entries['pose'][0]}", dict(taken_entries["pose"][1]))
+    if "pose" not in taken_entries and "T" in taken_entries and "R" not in taken_entries:
+        taken_entries["pose"] = taken_entries.pop("T")  # T, 4 × 4
+    if "pose" in taken_entries:
+        name, value = taken_entries["pose"]
         T = matrix_of(path, name, value, None)
         if T.size not in (12, 16) or (T.size == 16 and (T[12:] != (0, 0, 0, 1)).any()):
             raise InputError(f"{where}: {name} is no pose; expected 4 × 4 numbers, or R and T")
         T = T[:12].reshape(3, 4)
         R, t = T[:, :3], T[:, 3]
-    elif {"R", "T"} <= taken.keys():
-        name, value = taken["R"]
-        R, t = matrix_of(path, name, value, None), matrix_of(path, *taken["T"], None)
+    elif {"R", "T"} <= taken_entries.keys():
+        name, value = taken_entries["R"]
+        R, t = matrix_of(path, name, value, None), matrix_of(path, *taken_entries["T"], None)
         if R.size not in (3, 9) or t.size != 3:
             raise InputError(
-                f"{where}: {name} and {taken['T'][0]} have {R.size} and {t.size} numbers; expected "
+                f"{where}: {name} and {taken_entries['T'][0]} have {R.size} and {t.size} numbers; "
+                "expected "
                 "9, or 3 of a rotation vector, and 3"
             )
         R = R.reshape(3, 3) if R.size == 9 else matrices_of_rotation_vectors(R[None])[0]
-    elif taken:
-        ((_, (name, _)),) = taken.items()
+    elif taken_entries:
+        ((_, (name, _)),) = taken_entries.items()
         raise InputError(f"{where}: {name} without the other of R and T; expected both, or none")
     else:
         return None

@@ -123,16 +123,18 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     mirror = MIRROR if spherical and not cameras else np.ones(3)
     if spherical and not cameras:
         cameras, spherical = {key: _sphere(key, data) for key, data in spherical.items()}, {}
-    views, left = _views(scene, cameras, spherical)
+    views, left_out = _views(scene, cameras, spherical)
     poses = {key: pose for key, pose in _entries(scene, "extrinsics").items()}
     tie, rays = _structure(scene, "structure", views)
     control, clicks = _structure(scene, "control_points", views)
     # Numbers of control points and of structure are counted apart, and may be equal.
     names = {key: f"control {key}" if key in tie else str(key) for key in control}
-    seen = {view for view, *_ in (*rays, *clicks)}
+    seen_views = {view for view, *_ in (*rays, *clicks)}
     posed = {key for key, view in views.items() if view.get("id_pose") in poses}
-    lost = [_name(views[key]) for key in views if key not in posed and key not in seen]
-    views = {key: view for key, view in views.items() if key in posed or key in seen}
+    without_pose = [
+        _name(views[key]) for key in views if key not in posed and key not in seen_views
+    ]
+    views = {key: view for key, view in views.items() if key in posed or key in seen_views}
     if not views:
         raise InputError(f"{path}: no view has a pose or an image point")
     labels = unique_labels([_name(view) for view in views.values()], list(views))
@@ -151,7 +153,7 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             },
             Source(str(path), None, "observation"),
         ),
-        (*_describe_unread(views, left, lost, mirror is MIRROR), *unknown.messages()),
+        (*_describe_unread(views, left_out, without_pose, mirror is MIRROR), *unknown.messages()),
     )
     if not control or not len(network.points):
         return network
@@ -190,14 +192,17 @@ def _plain_values(rows: Any) -> Iterator[dict[str, Any]]:
 
 
 def _describe_unread(
-    views: Mapping[int, JsonFields], left: Sequence[str], lost: Sequence[str], mirrored: bool
+    views: Mapping[int, JsonFields],
+    left_out: Sequence[str],
+    without_pose: Sequence[str],
+    mirrored: bool,
 ) -> list[str]:
     """Messages about what is not read, and about a mirrored scene."""
     messages = [
         f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}"
         for ids, why in (
-            (left, "of spherical cameras or without intrinsics"),
-            (lost, "without pose and image points"),
+            (left_out, "of spherical cameras or without intrinsics"),
+            (without_pose, "without pose and image points"),
         )
         if ids
     ]
@@ -222,10 +227,10 @@ def _entries(scene: JsonFields, name: str) -> dict[int, JsonFields]:
 def _data(value: JsonFields) -> JsonFields:
     """The object of a pointer, with inherited fields."""
     data = value.child("ptr_wrapper.data")
-    fields, more = {}, data.document
-    while isinstance(more, dict):
-        fields = {**more, **fields}
-        more = more.get("value0")
+    fields, inherited = {}, data.document
+    while isinstance(inherited, dict):
+        fields = {**inherited, **fields}
+        inherited = inherited.get("value0")
     return JsonFields(data.path, fields)
 
 
@@ -283,19 +288,19 @@ def _views(
     scene: JsonFields, cameras: Mapping[int, dict], spherical: Mapping[int, JsonFields]
 ) -> tuple[dict[int, JsonFields], list[str]]:
     """The views with a camera, by number, and the names of the others."""
-    views, left = {}, []
+    views, left_out = {}, []
     for key, value in _entries(scene, "views").items():
         view = _data(value)
         camera = view.integer("id_intrinsic", UNDEFINED_INDEX)
         if camera in cameras:
             views[key] = view
         elif camera in spherical or camera == UNDEFINED_INDEX:
-            left.append(_name(view))
+            left_out.append(_name(view))
         else:
             raise InputError(f"{view.path}: id_intrinsic {camera} is not among the intrinsics")
     if not views:
         raise InputError(f"{scene.path}: no view has a camera that can be read")
-    return views, left
+    return views, left_out
 
 
 def _name(view: JsonFields) -> str:
@@ -346,8 +351,8 @@ def _points(
     path: Path, tie: Mapping[int, Any], control: Sequence[str], mirror: Float[np.ndarray, "3"]
 ) -> Columns:
     place = lambda k: (f"{path}, structure[{k}]", "X")
-    known = stack_rows(list(tie.values()), 3, place).reshape(-1, 3) * mirror
-    position = np.concatenate([known, np.full((len(control), 3), np.nan)])
+    known_coordinates = stack_rows(list(tie.values()), 3, place).reshape(-1, 3) * mirror
+    position = np.concatenate([known_coordinates, np.full((len(control), 3), np.nan)])
     columns = {"id": [*map(str, tie), *control], "role": ["tie"] * len(position)}
     return Columns(columns | dict(zip("XYZ", position.T)), Source(str(path), None, "point"))
 
@@ -365,19 +370,22 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
         _entry(i, {"rotation": R[i].tolist(), "center": images.position[i].tolist()})
         for i in range(len(images))
     ]
-    seen: list[list[dict]] = [[] for _ in points.id]
+    observations_of_point: list[list[dict]] = [[] for _ in points.id]
     features = np.zeros(len(images), int)
     for i, p, xy in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
-        seen[p].append(_entry(i, {"id_feat": int(features[i]), "x": xy}))
+        observations_of_point[p].append(_entry(i, {"id_feat": int(features[i]), "x": xy}))
         features[i] += 1
-    held = points.has_role("control", "fixed")
+    is_held = points.has_role("control", "fixed")
     numbers = written_numbers(points.id)
     tables = [
         [
-            _entry(numbers[p], {"X": points.position[p].tolist(), "observations": seen[p]})
+            _entry(
+                numbers[p],
+                {"X": points.position[p].tolist(), "observations": observations_of_point[p]},
+            )
             for p in np.flatnonzero(mask).tolist()
         ]
-        for mask in (~held, held)
+        for mask in (~is_held, is_held)
     ]
     scene = {
         "sfm_data_version": "0.3",
@@ -420,9 +428,9 @@ def _entry(key: int, value: dict[str, Any]) -> dict[str, Any]:
     return {"key": key, "value": value}
 
 
-def _intrinsics(cameras: Sequence[Camera], first: int) -> list[dict[str, Any]]:
-    """The entries of cameras, whose pointers are numbered from `first`; only the first of a kind
-    has its name."""
+def _intrinsics(cameras: Sequence[Camera], first_number: int) -> list[dict[str, Any]]:
+    """The entries of cameras, whose pointers are numbered from `first_number`; only the first of a
+    kind has its name."""
     entries, numbers = [], {}
     for k, camera in enumerate(cameras):
         name, data = _intrinsic(camera)
@@ -430,17 +438,19 @@ def _intrinsics(cameras: Sequence[Camera], first: int) -> list[dict[str, Any]]:
         if name not in numbers:
             numbers[name] = len(numbers) + 1
             kind = {"polymorphic_id": NEW_NUMBER + numbers[name], "polymorphic_name": name}
-        entries.append(_entry(k, kind | {"ptr_wrapper": {"id": first + k, "data": data}}))
+        entries.append(_entry(k, kind | {"ptr_wrapper": {"id": first_number + k, "data": data}}))
     return entries
 
 
 def _intrinsic(camera: Camera) -> tuple[str, dict[str, Any]]:
     """The smallest kind that holds a camera, and its fields."""
     kinds = {n: (field, c) for n, (model, field, c) in KINDS.items() if model == camera.model}
-    most = max((c for _, c in kinds.values()), key=len, default=())
-    p = check_others_zero(camera, "openMVG", most)
+    all_coefficients = max((c for _, c in kinds.values()), key=len, default=())
+    p = check_others_zero(camera, "openMVG", all_coefficients)
     (w, h), f = size_of(camera, "openMVG"), one_focal_length(camera, "openMVG")
-    name = next(n for n, (_, c) in kinds.items() if not any(p[k] for k in most if k not in c))
+    name = next(
+        n for n, (_, c) in kinds.items() if not any(p[k] for k in all_coefficients if k not in c)
+    )
     field, names = kinds[name]
     data = {"width": w, "height": h, "focal_length": f, "principal_point": [p["cx"], p["cy"]]}
     return name, data | ({field: [p[k] for k in names]} if field else {})

@@ -193,32 +193,34 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     file = path / RECONSTRUCTION if path.is_dir() else path
-    scene, told = _largest(file)
+    scene, messages = _largest(file)
     unknown = UnknownKeys()
     unknown.check(scene.document, SCENE_KEYS, file)
     for fields in scene.objects("cameras").values():
         unknown.check(fields.document, CAMERA_KEYS, fields.path)
-    cameras, refused = _cameras(scene)
-    shots, lost = {}, []
+    cameras, refusals = _cameras(scene)
+    shots, lost_shots = {}, []
     for id, shot in scene.objects("shots").items():
         unknown.check(shot.document, SHOT_KEYS, shot.path)
         camera = shot.text("camera")
         if camera in cameras:
             shots[id] = shot
-        elif camera in refused:
-            lost.append(id)
+        elif camera in refusals:
+            lost_shots.append(id)
         else:
             raise InputError(f"{shot.path}: camera {camera!r} is not among the cameras")
     if not shots:
-        raise next(iter(refused.values()), InputError(f"{file}: there are no shots"))
-    if lost:
-        why = "; ".join(str(error).removeprefix(f"{file}, ") for error in refused.values())
-        told.append(f"{why}; left out {count(len(lost), 'shot')}: {list_some(lost)}")
+        raise next(iter(refusals.values()), InputError(f"{file}: there are no shots"))
+    if lost_shots:
+        why = "; ".join(str(error).removeprefix(f"{file}, ") for error in refusals.values())
+        messages.append(
+            f"{why}; left out {count(len(lost_shots), 'shot')}: {list_some(lost_shots)}"
+        )
     gps = _positions(shots)
     points = scene.objects("points")
     for point in points.values():
         unknown.check(point.document, POINT_KEYS, point.path)
-    at, colours = (
+    coordinates, colours = (
         stack_rows(
             [p.get(name, default) for p in points.values()],
             3,
@@ -226,21 +228,25 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ).reshape(-1, 3)
         for name, default in (("coordinates", None), ("color", GREY))
     )
-    rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
-    if missing:
-        told.append(f"left out {count(missing, 'image point')} of tracks that have no point")
+    rays, number_missing = _tracks(file.parent / TRACKS, cameras, shots, points)
+    if number_missing:
+        messages.append(
+            f"left out {count(number_missing, 'image point')} of tracks that have no point"
+        )
     if points and rays is None:
-        told.append(f"{file.parent / TRACKS} is not there: no image points")
+        messages.append(f"{file.parent / TRACKS} is not there: no image points")
     names, control = list(points), None
     if (file.parent / CONTROL).is_file():
-        used = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
-        control = read_ground_control(file.parent / CONTROL, file.parent / REFERENCE, used)
-        told += control.messages
+        camera_of_shot = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
+        control = read_ground_control(
+            file.parent / CONTROL, file.parent / REFERENCE, camera_of_shot
+        )
+        messages += control.messages
         control = control.renamed({*names})
-        names, at, rays = _add_control(file, control, names, at, rays)
-        colours = np.concatenate([colours, np.full((len(at) - len(colours), 3), np.nan)])
+        names, coordinates, rays = _add_control(file, control, names, coordinates, rays)
+        colours = np.concatenate([colours, np.full((len(coordinates) - len(colours), 3), np.nan)])
     if (file.parent / REFERENCE).is_file():
-        told.append(_reference(file.parent / REFERENCE))
+        messages.append(_reference(file.parent / REFERENCE))
     datum = {"datum": "control"} if gps else {}
     network = assemble(
         file,
@@ -250,11 +256,11 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         overrides,
         _images(file, shots),
         Columns(
-            {"id": names, **dict(zip("XYZ", at.T)), **colour_columns(colours)},
+            {"id": names, **dict(zip("XYZ", coordinates.T)), **colour_columns(colours)},
             Source(str(file), None, "point"),
         ),
         rays,
-        (*told, *fit_messages(cameras.values()), *unknown.messages()),
+        (*messages, *fit_messages(cameras.values()), *unknown.messages()),
     )
     network = network.replace(further=gps)
     if control is None or control.points is None or not len(network.points):
@@ -266,22 +272,22 @@ def _add_control(
     file: Path,
     control: GroundControl,
     names: Sequence[str],
-    at: Float[np.ndarray, "n 3"],
+    coordinates: Float[np.ndarray, "n 3"],
     rays: Columns | None,
 ) -> tuple[list[str], Float[np.ndarray, "m 3"], Columns]:
     """Points and image points with those of ground control."""
-    added = [*(control.points.id if control.points else ()), *control.unknown]
+    added_names = [*(control.points.id if control.points else ()), *control.unknown]
     columns: dict[str, list] = {}
     for k, name in enumerate(("image", "point", "x", "y")):
         tracked = () if rays is None else rays.values[name]
         columns[name] = [*tracked, *(row[k] for row in control.rays)]
-    unknown = np.full((len(added), 3), np.nan)
+    unknown = np.full((len(added_names), 3), np.nan)
     source = Source(str(file.parent / CONTROL), None, "observation")
     if rays is not None and rays.source.numbers is not None:
         # Lines of the tracks; the image points of control have none.
         lines = np.r_[rays.source.numbers, np.zeros(len(control.rays), np.int64)]
         source = dataclasses.replace(rays.source, numbers=lines)
-    return [*names, *added], np.concatenate([at, unknown]), Columns(columns, source)
+    return [*names, *added_names], np.concatenate([coordinates, unknown]), Columns(columns, source)
 
 
 def _largest(file: Path) -> tuple[JsonFields, list[str]]:
@@ -292,24 +298,24 @@ def _largest(file: Path) -> tuple[JsonFields, list[str]]:
     sizes = [len(scene.get("shots") or ()) for scene in scenes]
     largest = int(np.argmax(sizes))
     scene = JsonFields(file, scenes[largest].document)
-    others = sum(sizes) - sizes[largest]
+    other_shots = sum(sizes) - sizes[largest]
     # Each part has its own datum: they cannot be one network.
     if len(scenes) == 1:
         return scene, []
     return scene, [
         f"the largest of {len(scenes)} reconstructions is read; the others have "
-        f"{count(others, 'shot')}"
+        f"{count(other_shots, 'shot')}"
     ]
 
 
 def _cameras(scene: JsonFields) -> tuple[dict[str, Camera], dict[str, NoPlaceError]]:
-    cameras, refused = {}, {}
+    cameras, refusals = {}, {}
     for id, fields in scene.objects("cameras").items():
         try:
             cameras[id] = _camera(id, fields)
         except NoPlaceError as error:
-            refused[id] = error
-    return cameras, refused
+            refusals[id] = error
+    return cameras, refusals
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
@@ -321,8 +327,8 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         middle = {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}
         return Camera(id, "equirectangular", {"fx": f, "fy": f} | middle, image_size=size)
     if kind not in (*KINDS, *FITTED_KINDS):
-        known = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
-        raise InputError(f"{fields.path}: projection_type is {kind}; expected one of {known}")
+        known_types = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
+        raise InputError(f"{fields.path}: projection_type is {kind}; expected one of {known_types}")
     single = kind in ("perspective", "fisheye", "dual")  # one focal length, centred
     f = [
         max(size) * fields.number(name)
@@ -339,26 +345,32 @@ def _camera(id: str, fields: JsonFields) -> Camera:
         tie = (("fx", "fy"),) if single else ()
         return Camera(id, model, core | coefficients, image_size=size, tie=tie)
     if kind == "dual":
-        own = {"l": fields.number("transition", 0.5)}
-        own |= {name: fields.number(name, 0.0) for name in ("k1", "k2")}
+        parameters = {"l": fields.number("transition", 0.5)}
+        parameters |= {name: fields.number(name, 0.0) for name in ("k1", "k2")}
         formula = _dual
     else:
-        own = {name: fields.number(name, 0.0) for name in PRISM}
-        exact = {"sx1": own["s0"], "sy1": own["s2"]} if own["s0"] or own["s2"] else {}
-        if not any(own[name] for name in ("k5", "k6", "s1", "s3")):
+        parameters = {name: fields.number(name, 0.0) for name in PRISM}
+        exact = (
+            {"sx1": parameters["s0"], "sy1": parameters["s2"]}
+            if parameters["s0"] or parameters["s2"]
+            else {}
+        )
+        if not any(parameters[name] for name in ("k5", "k6", "s1", "s3")):
             model = "thin-prism-fisheye" if exact else "kannala-brandt-tangential"
-            p = {name: own[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+            p = {name: parameters[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
             return Camera(id, model, core | p | exact, image_size=size)
         formula = _prism
-    foreign = Foreign(formula, core | own, core, size, fisheye=True)
+    foreign = Foreign(formula, core | parameters, core, size, fisheye=True)
     return fit_camera(id, foreign, str(fields.path), f"is of projection_type {kind}")
 
 
 def _prism(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """fisheye624: decentring and thin prism are of the image of the angle, as the radial part."""
-    off = root(X * X + Y * Y)
+    radius = root(X * X + Y * Y)
     # θ/|[X, Y]|, whose limit on the axis is 1/Z
-    scale = jnp.where(off > 0, jnp.arctan2(off, Z) / jnp.where(off > 0, off, 1.0), 1 / Z)
+    scale = jnp.where(
+        radius > 0, jnp.arctan2(radius, Z) / jnp.where(radius > 0, radius, 1.0), 1 / Z
+    )
     x, y = X * scale, Y * scale
     t2 = x * x + y * y
     radial = 1 + sum(p[f"k{i}"] * t2**i for i in range(1, 7))
@@ -370,9 +382,9 @@ def _prism(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Ar
 
 def _dual(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """Between a perspective image and one of the angle."""
-    off = root(X * X + Y * Y)
-    angle = jnp.arctan2(off, Z)
-    fish = jnp.where(off > 0, angle / jnp.where(off > 0, off, 1.0), 1 / Z)
+    radius = root(X * X + Y * Y)
+    angle = jnp.arctan2(radius, Z)
+    fish = jnp.where(radius > 0, angle / jnp.where(radius > 0, radius, 1.0), 1 / Z)
     scale = p["l"] / Z + (1 - p["l"]) * fish
     x, y = X * scale, Y * scale
     r2 = x * x + y * y
@@ -420,7 +432,7 @@ def _tracks(
     if not file.is_file():
         return None, 0
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y")}
-    lines, missing = [], 0
+    lines, number_missing = [], 0
     for row in TextRows(file, separator="\t"):
         if row.text.startswith(HEAD):
             version = row.text.removeprefix(HEAD).strip()
@@ -434,7 +446,7 @@ def _tracks(
         if image not in shots:
             continue
         if point not in points:
-            missing += 1
+            number_missing += 1
             continue
         x, y = row.numbers(("x", "y"), 3, more=True)
         w, h = not_none(cameras[shots[image].text("camera")].image_size)
@@ -442,15 +454,15 @@ def _tracks(
         for column, value in zip(columns.values(), values):
             column.append(value)
         lines.append(row.number)
-    return Columns(columns, Source(str(file), np.array(lines, np.int64), "line")), missing
+    return Columns(columns, Source(str(file), np.array(lines, np.int64), "line")), number_missing
 
 
 def _reference(file: Path) -> str:
     fields = JsonFields(file, read_object(file, read_text(file), "a reference"))
-    at = ", ".join(
+    reference_in_words = ", ".join(
         f"{name} {fields.number(name):.9g}" for name in ("latitude", "longitude", "altitude")
     )
-    return f"coordinates are topocentric about {at} ({REFERENCE})"
+    return f"coordinates are topocentric about {reference_in_words} ({REFERENCE})"
 
 
 def write_opensfm(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:
@@ -476,10 +488,10 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     cameras = {camera.id: _camera_fields(camera) for camera in network.cameras}
     R, t = cv_pose(matrices_of(images.angles), images.position)
     turn = rotation_vectors_of(R)
-    used = [network.cameras[c] for c in images.camera.tolist()]
+    camera_of_image = [network.cameras[c] for c in images.camera.tolist()]
     shots = {
-        id: {"camera": camera.id, "rotation": v, "translation": at}
-        for id, camera, v, at in zip(images.id, used, turn.tolist(), t.tolist())
+        id: {"camera": camera.id, "rotation": v, "translation": translation}
+        for id, camera, v, translation in zip(images.id, camera_of_image, turn.tolist(), t.tolist())
     }
     # gps_position is the projection centre: antennas with a lever arm are not
     measured = [
@@ -501,7 +513,9 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     folder.mkdir(exist_ok=True)
     write_text(folder / RECONSTRUCTION, json.dumps([scene], indent=1) + "\n")
     write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
-    write_text(folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in used]))
+    write_text(
+        folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in camera_of_image])
+    )
     return describe_losses(network, OPENSFM_LOSSES)
 
 
@@ -540,9 +554,13 @@ def write_opensfm_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
 
 def _camera_fields(camera: Camera) -> dict[str, Any]:
     """The fields of a camera, of the smallest kind that holds it."""
-    kinds = {name: rest for name, (model, *rest) in KINDS.items() if model == camera.model}
-    most = max((names for _, names in kinds.values()), key=len, default=())
-    p = check_others_zero(camera, "OpenSfM", most)
+    kinds = {
+        name: focal_and_names
+        for name, (model, *focal_and_names) in KINDS.items()
+        if model == camera.model
+    }
+    all_coefficients = max((names for _, names in kinds.values()), key=len, default=())
+    p = check_others_zero(camera, "OpenSfM", all_coefficients)
     w, h = size_of(camera, "OpenSfM")
     s = max(w, h)
     c = [(p["cx"] - (w - 1) / 2) / s, (p["cy"] - (h - 1) / 2) / s]
@@ -550,7 +568,8 @@ def _camera_fields(camera: Camera) -> dict[str, Any]:
     name = next(
         name
         for name, (focal, names) in kinds.items()
-        if (centred or focal == TWO_FOCAL_LENGTHS) and not any(p[k] for k in most if k not in names)
+        if (centred or focal == TWO_FOCAL_LENGTHS)
+        and not any(p[k] for k in all_coefficients if k not in names)
     )
     focal, names = kinds[name]
     fields = {"projection_type": name, "width": w, "height": h}

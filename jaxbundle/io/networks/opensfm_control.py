@@ -52,10 +52,10 @@ class GroundControl(NamedTuple):
     unknown: list[str]
     messages: tuple[str, ...]
 
-    def renamed(self, taken: Collection[str]) -> "GroundControl":
+    def renamed(self, taken_names: Collection[str]) -> "GroundControl":
         """With names of their own: tracks and control are numbered apart, and may be equal."""
-        own = [*(self.points.id if self.points else ()), *self.unknown]
-        new = {id: f"control {id}" if id in taken else id for id in own}
+        own_names = [*(self.points.id if self.points else ()), *self.unknown]
+        new = {id: f"control {id}" if id in taken_names else id for id in own_names}
         points = self.points and dataclasses.replace(
             self.points, id=tuple(new[id] for id in self.points.id)
         )
@@ -98,27 +98,29 @@ def read_ground_control(
                 w, h = not_none(cameras[image].image_size)
                 side = max(w, h)
                 rays.append((image, id, side * x + (w - 1) / 2, side * y + (h - 1) / 2))
-    seen = {point for _, point, *_ in rays}
-    told = list(unknown.messages())
-    keep = [k for k, id in enumerate(ids) if id in seen]
+    seen_points = {point for _, point, *_ in rays}
+    messages = list(unknown.messages())
+    keep = [k for k, id in enumerate(ids) if id in seen_points]
     points = None
     if keep and not reference.is_file():
-        told.append(
+        messages.append(
             f"{file.name}: left out {count(len(keep), 'control point')}: latitudes and longitudes "
             f"need {reference.name}, which is not beside it"
         )
-        lost = {ids[k] for k in keep}
-        rays = [ray for ray in rays if ray[1] not in lost]
+        dropped = {ids[k] for k in keep}
+        rays = [ray for ray in rays if ray[1] not in dropped]
     elif keep:
         sigma = np.tile([HORIZONTAL_SIGMA, HORIZONTAL_SIGMA, VERTICAL_SIGMA], (len(keep), 1))
         local = _topocentric(_origin(reference), np.array(places)[keep])
         names = tuple(ids[k] for k in keep)
         points = Points(names, ("control",) * len(keep), local, sigma, Source(str(file)))
-        told.append(
+        messages.append(
             f"{file.name}: {len(keep)} control points, whose σ are not in it; taken as OpenSfM's, "
             f"{HORIZONTAL_SIGMA:g} m, {VERTICAL_SIGMA:g} m in height (--control FILE gives others)"
         )
-    return GroundControl(points, rays, [id for id in unplaced if id in seen], tuple(told))
+    return GroundControl(
+        points, rays, [id for id in unplaced if id in seen_points], tuple(messages)
+    )
 
 
 def _origin(reference: Path) -> Float[np.ndarray, "3"]:

@@ -86,13 +86,13 @@ class Resources(NamedTuple):
 
     def document(self, kind: str) -> JsonFields | None:
         """The only file of a format; None if there is none."""
-        found = self.files.get(kind, [])
-        if len(found) > 1:
+        files_of_kind = self.files.get(kind, [])
+        if len(files_of_kind) > 1:
             raise InputError(
-                f"{self.path}: {len(found)} resources of format {kind}, "
-                f"{list_some(found, as_text=str)}; expected a project with one calibration"
+                f"{self.path}: {len(files_of_kind)} resources of format {kind}, "
+                f"{list_some(files_of_kind, as_text=str)}; expected a project with one calibration"
             )
-        return _read(found[0], kind, self.unknown) if found else None
+        return _read(files_of_kind[0], kind, self.unknown) if files_of_kind else None
 
 
 def is_opf(path: Path) -> bool:
@@ -115,9 +115,9 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(
             f"{path}: a project without calibrated cameras; expected one after its calibration"
         )
-    told: list[str] = []
-    cameras = _sensors(calibrated, resources.document(INPUT_CAMERAS), told)
-    shift = _shift(resources.document(FRAME), told)
+    messages: list[str] = []
+    cameras = _sensors(calibrated, resources.document(INPUT_CAMERAS), messages)
+    shift = _shift(resources.document(FRAME), messages)
     rows = calibrated.rows("cameras")
     if not rows:
         raise InputError(f"{calibrated.path}: there are no cameras")
@@ -125,8 +125,8 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     files = _files(resources.document(CAMERA_LIST))
     labels = unique_labels([files.get(id, id) for id in ids], ids)
     names = dict(zip(ids, labels))
-    used = [_id(row, "sensor_id") for row in rows]
-    for row, id in zip(rows, used):
+    sensor_ids = [_id(row, "sensor_id") for row in rows]
+    for row, id in zip(rows, sensor_ids):
         if id not in cameras:
             raise InputError(f"{row.path}: sensor {id} is not in the file")
     angles = np.radians([row.array("orientation_deg", (3,)) for row in rows])
@@ -134,20 +134,20 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     images = image_columns(
         Source(str(calibrated.path), None, "camera"),
         labels,
-        [cameras[id]["id"] for id in used],
+        [cameras[id]["id"] for id in sensor_ids],
         np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in angles]),
         X0,
     )
-    marked, seen, control = _control(resources, names, shift, told)
+    marked, marks, control = _control(resources, names, shift, messages)
     tie, rays = _tracks(resources, names, shift)
     network = assemble(
         path,
         foreign_document(path.stem, cameras.values(), object_unit="m"),
         overrides,
         images,
-        _joined(marked, tie, Source(str(path), None, "point")),
-        _joined(seen, rays, Source(str(path), None, "image point")),
-        (*told, *unknown.messages()),
+        _join_columns(marked, tie, Source(str(path), None, "point")),
+        _join_columns(marks, rays, Source(str(path), None, "image point")),
+        (*messages, *unknown.messages()),
     )
     if control is not None:
         network = with_control(network, control, datum=not choose_datum(overrides))
@@ -192,8 +192,8 @@ def _id(row: JsonFields, key: str) -> str:
     # Not `integer`, which a float beyond 2⁵³ would not reach: identifiers have 64 bits.
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
-        said = "missing" if value is None else f"{value!r}; expected a whole number"
-        raise InputError(f"{row.path}: {key} is {said}")
+        fault = "missing" if value is None else f"{value!r}; expected a whole number"
+        raise InputError(f"{row.path}: {key} is {fault}")
     return str(value)
 
 
@@ -211,21 +211,24 @@ def _files(camera_list: JsonFields | None) -> dict[str, str]:
 
 
 def _sensors(
-    calibrated: JsonFields, given: JsonFields | None, told: list[str]
+    calibrated: JsonFields, input_cameras: JsonFields | None, messages: list[str]
 ) -> dict[str, dict[str, Any]]:
     """The entries of the sensors by id."""
-    described = {_id(row, "id"): row for row in ([] if given is None else given.rows("sensors"))}
+    described = {
+        _id(row, "id"): row
+        for row in ([] if input_cameras is None else input_cameras.rows("sensors"))
+    }
     rows = {_id(row, "id"): row for row in calibrated.rows("sensors")}
     labels = [str(described[id].get("name") or id) if id in described else id for id in rows]
-    found = {}
+    entries = {}
     for (id, row), label in zip(rows.items(), unique_labels(labels, list(rows))):
         internals = row.child("internals")
         size = described[id].array("image_size_px", (2,)) if id in described else None
         entry, fit = _camera(internals, size)
-        told += [f"sensor {label!r}: {fit}"] if fit else []
+        messages += [f"sensor {label!r}: {fit}"] if fit else []
         sizes = {} if size is None else {"image_size": [int(n) for n in size]}
-        found[id] = {"id": label, **sizes, **entry}
-    return found
+        entries[id] = {"id": label, **sizes, **entry}
+    return entries
 
 
 def _camera(
@@ -262,11 +265,13 @@ def _camera(
 
 def _project_fisheye(p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """The formula of the specification, from the centre of the first pixel."""
-    off = root(X * X + Y * Y)
+    radius = root(X * X + Y * Y)
     # The angle to the axis, 1 at 90°.
-    theta = 2 / np.pi * jnp.arctan2(off, Z)
+    theta = 2 / np.pi * jnp.arctan2(radius, Z)
     rho = sum(p["p"][i] * theta**i for i in range(len(p["p"])))
-    x, y = (jnp.where(off > 0, rho * a / jnp.where(off > 0, off, 1.0), 0.0) for a in (X, Y))
+    x, y = (
+        jnp.where(radius > 0, rho * a / jnp.where(radius > 0, radius, 1.0), 0.0) for a in (X, Y)
+    )
     A = p["A"]
     return jnp.stack([A[0] * x + A[1] * y + p["cx"], A[2] * x + A[3] * y + p["cy"]])
 
@@ -274,7 +279,7 @@ def _project_fisheye(p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> F
 # --- coordinates ----------------------------------------------------------------------------
 
 
-def _shift(frame: JsonFields | None, told: list[str]) -> Float[np.ndarray, "3"]:
+def _shift(frame: JsonFields | None, messages: list[str]) -> Float[np.ndarray, "3"]:
     """What positions have on top of the canonical coordinates."""
     if frame is None:
         return np.zeros(3)
@@ -282,7 +287,7 @@ def _shift(frame: JsonFields | None, told: list[str]) -> Float[np.ndarray, "3"]:
     base = frame.child("base_to_canonical")
     scale = base.array("scale", (3,))
     if (scale != 1).any() or base.get("swap_xy"):
-        told.append(
+        messages.append(
             f"{frame.path}: coordinates are canonical (right-handed, one unit): those of the base "
             f"system times {', '.join(f'{s:g}' for s in scale)}"
             f"{', x and y exchanged' if base.get('swap_xy') else ''}"
@@ -294,52 +299,55 @@ def _control(
     resources: Resources,
     images: Mapping[str, str],
     shift: Float[np.ndarray, "3"],
-    told: list[str],
+    messages: list[str],
 ) -> tuple[dict[str, Any], dict[str, Any], Points | None]:
     """Columns of the points with marks, and of their image points; control and check points."""
-    given, projected = resources.document(INPUT_POINTS), resources.document(PROJECTED_POINTS)
+    input_points, projected = resources.document(INPUT_POINTS), resources.document(PROJECTED_POINTS)
     # Manual tie points have marks as control points have, but no coordinates.
-    rows = [] if given is None else [*given.rows("gcps"), *given.rows("mtps")]
+    rows = [] if input_points is None else [*input_points.rows("gcps"), *input_points.rows("mtps")]
     ids, checks, marks = [], {}, []
     for row in rows:
         id = row.text("id")
-        here = []
+        marks_of_point = []
         for mark in row.rows("marks"):
             if (image := images.get(_id(mark, "camera_id"))) is not None:
-                here.append((image, id, *(mark.array("position_px", (2,)) - PIXEL_CENTRE)))
-        if here:
+                marks_of_point.append(
+                    (image, id, *(mark.array("position_px", (2,)) - PIXEL_CENTRE))
+                )
+        if marks_of_point:
             ids.append(id)
             checks[id] = bool(row.get("is_checkpoint"))
-            marks += here
-    none = [None] * len(ids)
-    points = {"id": ids, "role": ["tie"] * len(ids), "X": none, "Y": none, "Z": none}
+            marks += marks_of_point
+    blank = [None] * len(ids)
+    points = {"id": ids, "role": ["tie"] * len(ids), "X": blank, "Y": blank, "Z": blank}
     image, point, x, y = zip(*marks) if marks else ((), (), (), ())
-    seen = {"image": image, "point": point, "x": x, "y": y}
-    known = [] if projected is None else projected.rows("projected_gcps")
-    known = [row for row in known if row.text("id") in checks]
-    if not known:
-        if given is not None and given.rows("gcps"):
-            told.append(
-                f"{given.path}: its control points have no projected coordinates; their marks are "
+    mark_rows = {"image": image, "point": point, "x": x, "y": y}
+    projected_rows = [] if projected is None else projected.rows("projected_gcps")
+    projected_rows = [row for row in projected_rows if row.text("id") in checks]
+    if not projected_rows:
+        if input_points is not None and input_points.rows("gcps"):
+            messages.append(
+                f"{input_points.path}: its control points have no projected coordinates; their "
+                "marks are "
                 "read as those of tie points"
             )
-        return points, seen, None
-    names = [row.text("id") for row in known]
+        return points, mark_rows, None
+    names = [row.text("id") for row in projected_rows]
     control = Points(
         tuple(names),
         tuple("check" if checks[name] else "control" for name in names),
-        np.array([row.array("coordinates", (3,)) for row in known]) - shift,
-        np.array([row.array("sigmas", (3,)) for row in known]),
+        np.array([row.array("coordinates", (3,)) for row in projected_rows]) - shift,
+        np.array([row.array("sigmas", (3,)) for row in projected_rows]),
         Source(str(resources.path)),
     )
     # Fewer than three points do not determine the seven parameters of a datum.
     if control.role.count("control") < 3:
-        told.append(
+        messages.append(
             f"{resources.path}: {control.role.count('control')} control points with marks; they "
             "are not used, since three are needed for a datum"
         )
-        return points, seen, None
-    return points, seen, control
+        return points, mark_rows, None
+    return points, mark_rows, control
 
 
 # --- tie points -----------------------------------------------------------------------------
@@ -366,8 +374,8 @@ def _tracks(
             continue
         matches = primitive.child("extensions").child(MATCHES)
         X = _positions(file, node, primitive) - shift
-        first = len(points["id"])
-        names = [f"t{first + k}" for k in range(len(X))]
+        number_before = len(points["id"])
+        names = [f"t{number_before + k}" for k in range(len(X))]
         points["id"] += names
         points["role"] += ["tie"] * len(X)
         for axis, column in zip("XYZ", X.T.tolist()):
@@ -389,13 +397,13 @@ def _tracks(
             )
         # The rows of the matches of the first point, the second, …: ranges may be in any order.
         point = np.repeat(np.arange(len(X)), number)
-        at = np.repeat(begin - np.cumsum(number) + number, number) + np.arange(number.sum())
+        match_rows = np.repeat(begin - np.cumsum(number) + number, number) + np.arange(number.sum())
         seen_in = [images.get(uid) for uid in uids]
-        kept = np.array([seen_in[c] is not None for c in camera[at]], bool)
-        at, point = at[kept], point[kept]
-        rays["image"] += [seen_in[c] for c in camera[at]]
+        is_kept = np.array([seen_in[c] is not None for c in camera[match_rows]], bool)
+        match_rows, point = match_rows[is_kept], point[is_kept]
+        rays["image"] += [seen_in[c] for c in camera[match_rows]]
         rays["point"] += [names[p] for p in point]
-        for name, column in zip("xy", (xy[at].astype(float) - PIXEL_CENTRE).T.tolist()):
+        for name, column in zip("xy", (xy[match_rows].astype(float) - PIXEL_CENTRE).T.tolist()):
             rays[name] += column
     if colours:
         points |= colour_columns(np.concatenate(colours))
@@ -406,19 +414,23 @@ def _positions(
     file: JsonFields, node: JsonFields, primitive: JsonFields
 ) -> Float[np.ndarray, "n 3"]:
     """The points of a mesh in the processing system."""
-    own = _accessor(file, primitive.child("attributes").integer("POSITION"), "VEC3").astype(float)
+    own_positions = _accessor(
+        file, primitive.child("attributes").integer("POSITION"), "VEC3"
+    ).astype(float)
     # By columns, in double precision: it holds the offset of single-precision positions.
     T = node.array("matrix", (16,), np.eye(4).ravel().tolist()).reshape(4, 4).T
-    x, y, z = (own @ T[:3, :3].T + T[:3, 3]).T
+    x, y, z = (own_positions @ T[:3, :3].T + T[:3, 3]).T
     return np.stack([x, -z, y], 1)
 
 
 def _colours(file: JsonFields, primitive: JsonFields, n: int) -> Float[np.ndarray, "n 3"]:
-    at = primitive.get("attributes.COLOR_0")
-    if at is None:
+    colour_accessor = primitive.get("attributes.COLOR_0")
+    if colour_accessor is None:
         return np.full((n, 3), np.nan)
-    found = _accessor(file, JsonFields(file.path, {"COLOR_0": at}).integer("COLOR_0"), None)
-    return found[:, :3].astype(float)
+    colours = _accessor(
+        file, JsonFields(file.path, {"COLOR_0": colour_accessor}).integer("COLOR_0"), None
+    )
+    return colours[:, :3].astype(float)
 
 
 def _ranges(file: JsonFields, matches: JsonFields, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -428,8 +440,8 @@ def _ranges(file: JsonFields, matches: JsonFields, n: int) -> tuple[np.ndarray, 
         raise InputError(f"{file.path}: {len(pair)} ranges of matches of {n} points")
     # Little-endian: the first of the two numbers of 32 bits is the low one.
     packed = pair[:, 0] | (pair[:, 1] << np.uint64(32))
-    first = packed & np.uint64(2**40 - 1)
-    return first.astype(np.int64), (packed >> np.uint64(40)).astype(np.int64)
+    first_match = packed & np.uint64(2**40 - 1)
+    return first_match.astype(np.int64), (packed >> np.uint64(40)).astype(np.int64)
 
 
 def _of(file: JsonFields, key: str, index: int) -> JsonFields:
@@ -463,24 +475,27 @@ def _accessor(file: JsonFields, index: int, kind: str | None) -> np.ndarray:
     begin = view.integer("byteOffset", 0) + accessor.integer("byteOffset", 0)
     try:
         # Before anything is allocated for a count in a damaged header.
-        there = place.stat().st_size
-        if begin + number * dtype.itemsize > there:
+        bytes_present = place.stat().st_size
+        if begin + number * dtype.itemsize > bytes_present:
             raise InputError(
-                f"{place}: {there} bytes, where {begin + number * dtype.itemsize} are expected"
+                f"{place}: {bytes_present} bytes, where {begin + number * dtype.itemsize} are "
+                "expected"
             )
-        found = np.fromfile(place, dtype, number, offset=begin)
+        numbers = np.fromfile(place, dtype, number, offset=begin)
     except OSError as error:
         raise InputError(f"{place}: cannot be read: {error.strerror}") from None
-    if dtype.kind == "f" and not np.isfinite(found).all():
+    if dtype.kind == "f" and not np.isfinite(numbers).all():
         raise InputError(f"{place}: a number that is not finite")
-    return found.reshape(-1, LENGTHS[form])
+    return numbers.reshape(-1, LENGTHS[form])
 
 
-def _joined(first: Mapping[str, Any], more: Mapping[str, Any], source: Source) -> Columns:
+def _join_columns(
+    first_table: Mapping[str, Any], second_table: Mapping[str, Any], source: Source
+) -> Columns:
     """The rows of two tables; a column that one lacks is empty there."""
-    n, m = (len(next(iter(table.values()))) for table in (first, more))
+    n, m = (len(next(iter(table.values()))) for table in (first_table, second_table))
     columns = {
-        name: [*first.get(name, [None] * n), *more.get(name, [None] * m)]
-        for name in {**first, **more}
+        name: [*first_table.get(name, [None] * n), *second_table.get(name, [None] * m)]
+        for name in {**first_table, **second_table}
     }
     return Columns(columns, source)

@@ -52,5 +52,5 @@ def read_orb_slam_pair(path: str | Path, overrides: Sequence[str] = ()) -> Netwo
         T = T[:12].reshape(3, 4)
         check_rotations(T[:, :3], f"{path}: {key}")
         R, t = T[:, :3].T, -T[:, :3].T @ T[:, 3]
-    told = (*fit_messages(cameras), *unknown.messages())
-    return rig_network(path, cameras, [np.eye(3), R], [np.zeros(3), t], overrides, told)
+    messages = (*fit_messages(cameras), *unknown.messages())
+    return rig_network(path, cameras, [np.eye(3), R], [np.zeros(3), t], overrides, messages)

@@ -37,8 +37,8 @@ class OrientationCovariance:
 
     def index(self, unknowns: Sequence[Unknown]) -> Int[np.ndarray, " k"]:
         """The rows of some unknowns; −1: held."""
-        at = {unknown: k for k, unknown in enumerate(self.unknowns)}
-        return np.array([at.get(unknown, -1) for unknown in unknowns], int)
+        row_of = {unknown: k for k, unknown in enumerate(self.unknowns)}
+        return np.array([row_of.get(unknown, -1) for unknown in unknowns], int)
 
     def rows(self, image: str, camera: str, parameters: Sequence[str]) -> Int[np.ndarray, " k"]:
         """The rows of X0 … kappa of an image and of parameters of its camera; −1: held."""
@@ -91,14 +91,14 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
     unknowns = tuple(
         (str(a).strip(), str(b).strip(), str(c).strip()) for a, b, c in zip(kinds, ids, names)
     )
-    seen: dict[Unknown, int] = {}
+    first_row: dict[Unknown, int] = {}
     for k, unknown in enumerate(unknowns):
-        if unknown in seen:
+        if unknown in first_row:
             raise InputError(
                 f"{table.source(k)}: {' '.join(unknown)} is listed twice, also in "
-                f"{table.source(seen[unknown])}"
+                f"{table.source(first_row[unknown])}"
             )
-        seen[unknown] = k
+        first_row[unknown] = k
     # Correlations are written with all digits: what is below 0 is rounding of them, or edited.
     if n and np.linalg.eigvalsh(R)[0] < -1e-6 * n:
         raise InputError(
@@ -120,6 +120,6 @@ def _number(where: str, name: str, text: str) -> float:
         value = np.nan
     # 1e-9: a correlation of 1 may be rounded above it
     if not np.isfinite(value) or (value <= 0 if name == "sigma" else abs(value) > 1 + 1e-9):
-        what = "a σ above 0" if name == "sigma" else "a correlation"
-        raise InputError(f"{where}: {name} is {text!r}; expected {what}")
+        expected = "a σ above 0" if name == "sigma" else "a correlation"
+        raise InputError(f"{where}: {name} is {text!r}; expected {expected}")
     return value

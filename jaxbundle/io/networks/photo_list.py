@@ -184,17 +184,18 @@ class _Parser:
         self.next += 1
         return number, int(words[0])
 
-    def _image_point(self, photo: _Row, counted: str, done: int) -> _Row:
+    def _image_point(self, photo: _Row, counted: str, number_done: int) -> _Row:
         if not self._more():
             raise self._error(
-                self.lines[-1][0], f"the file ends after {count(done, 'image point')}; {counted}"
+                self.lines[-1][0],
+                f"the file ends after {count(number_done, 'image point')}; {counted}",
             )
         number, words = self.lines[self.next]
         if len(words) != 5:
             raise self._error(
                 number,
                 f"{count(len(words), 'value')} where an image point (id, x, y, σx, σy) is "
-                f"expected; {counted}, this is number {done + 1}",
+                f"expected; {counted}, this is number {number_done + 1}",
             )
         return self._row(words[0], words[1:], IMAGE_POINT, photo.id)
 
@@ -209,14 +210,14 @@ class _Parser:
         ]
         return dataclasses.replace(row, values=tuple(values))
 
-    def _number(self, line: int, what: str, word: str, finite: bool = True) -> float:
+    def _number(self, line: int, noun: str, word: str, finite: bool = True) -> float:
         try:
             number = float(word)
         except ValueError:
             number = None
         # float() reads 1_0 as ten
         if number is None or "_" in word or (finite and not math.isfinite(number)):
-            raise self._error(line, f"{what} is {word!r}; expected a number")
+            raise self._error(line, f"{noun} is {word!r}; expected a number")
         return number
 
     def _more(self) -> bool:

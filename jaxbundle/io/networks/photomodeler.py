@@ -97,15 +97,15 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
         rows.take("the title")
     rows.take("the title")
     head = [
-        _take(rows, what)
-        for what in ("tolerance and iterations", "default σ", "the default camera", "its σ")
+        _take(rows, noun)
+        for noun in ("tolerance and iterations", "default σ", "the default camera", "its σ")
     ]
     numbers = head[0].all_numbers("tolerance, iterations, width, height")
     size = numbers[2:4].tolist() if len(numbers) >= 4 else None
     photos = _photos(rows, header_camera(head[2]))
     if not photos:
         raise head[3].error("no photograph follows")
-    document, cameras, of_camera, half = _document(path, photos, size, overrides)
+    document, cameras, of_camera, half_units = _document(path, photos, size, overrides)
     control, objects = _points(rows, "control points"), _points(rows, "object points")
     names = dict(zip((photo.number for photo in photos), _names([photo.name for photo in photos])))
     marks = _marks(rows, names)
@@ -125,14 +125,20 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
         matrices_of(np.radians(outer[:, :2:-1])),  # κ, φ, ω in the file
         outer[:, :3],
     )
-    rest = [override for override in overrides if override not in of_camera]
-    network = assemble(path, document, rest, images, points, ray_table(path, marks, names))
+    other_overrides = [override for override in overrides if override not in of_camera]
+    network = assemble(
+        path, document, other_overrides, images, points, ray_table(path, marks, names)
+    )
     warnings = [renumbered] if renumbered else []
-    lost = [id for id, X in zip(points.values["id"], points.values["X"]) if np.isnan(X)]
-    if lost:
-        count_of_lost = count(len(lost), "point")
-        warnings.append(f"{count_of_lost} without coordinates in the file: {list_some(lost)}")
-    return network.warn(*warnings, *rounding_warnings(network.cameras, half))
+    without_coordinates = [
+        id for id, X in zip(points.values["id"], points.values["X"]) if np.isnan(X)
+    ]
+    if without_coordinates:
+        count_of_lost = count(len(without_coordinates), "point")
+        warnings.append(
+            f"{count_of_lost} without coordinates in the file: {list_some(without_coordinates)}"
+        )
+    return network.warn(*warnings, *rounding_warnings(network.cameras, half_units))
 
 
 def _document(
@@ -140,7 +146,7 @@ def _document(
 ) -> tuple[Document, list[str], list[str], Float[np.ndarray, "cameras 10"]]:
     """Settings and cameras with overrides; the camera of each photograph; the
     overrides used; and half a unit of the last decimal of the values of each camera."""
-    distinct, first, camera = np.unique(
+    distinct, first_photo, camera = np.unique(
         np.array([photo.inner for photo in photos]), axis=0, return_index=True, return_inverse=True
     )
     names = ["cam"] if len(distinct) == 1 else [f"cam{k + 1}" for k in range(len(distinct))]
@@ -155,8 +161,8 @@ def _document(
     document = apply_overrides(document, of_camera)
     for entry, values in zip(document["camera"], distinct):
         _add_pixel_size(path, entry, values)
-    half = np.array([photos[k].half_unit for k in first])
-    return document, [names[c] for c in camera.reshape(-1)], of_camera, half
+    half_units = np.array([photos[k].half_unit for k in first_photo])
+    return document, [names[c] for c in camera.reshape(-1)], of_camera, half_units
 
 
 def _add_pixel_size(path: Path, entry: dict[str, Any], values: Inner) -> None:
@@ -206,18 +212,18 @@ def _photos(rows: TextRows, header: tuple[Inner, Inner] | None) -> list[Photo]:
     return photos
 
 
-def _read_numbered(rows: TextRows, number: int, what: str) -> TextRow:
-    row = _take(rows, f"{what} of photograph {number}")
+def _read_numbered(rows: TextRows, number: int, noun: str) -> TextRow:
+    row = _take(rows, f"{noun} of photograph {number}")
     # A line that was lost would shift all values after it.
-    if row.integer(0, f"the number of the photograph before {what}") != number:
-        raise row.error(f"expected {what} of photograph {number}, not of {row.words[0]}")
+    if row.integer(0, f"the number of the photograph before {noun}") != number:
+        raise row.error(f"expected {noun} of photograph {number}, not of {row.words[0]}")
     return row
 
 
-def _points(rows: TextRows, what: str) -> PhotoModelerBlock:
+def _points(rows: TextRows, noun: str) -> PhotoModelerBlock:
     ids, values, lines = [], [], []
     for row in _block(rows):
-        ids.append(str(row.integer(0, f"the number of one of the {what}")))
+        ids.append(str(row.integer(0, f"the number of one of the {noun}")))
         values.append(row.numbers(POINT, 1))
         lines.append(row.number)
     return PhotoModelerBlock(ids, np.array(values).reshape(-1, 6), lines)
@@ -248,9 +254,9 @@ def _block(rows: TextRows) -> Iterator[TextRow]:
         yield row
 
 
-def _take(rows: TextRows, what: str) -> TextRow:
+def _take(rows: TextRows, noun: str) -> TextRow:
     """The next line of numbers, a decimal comma read as a point."""
-    row = rows.take(what)
+    row = rows.take(noun)
     return TextRow(row.path, row.number, row.text.replace(",", ".")) if "," in row.text else row
 
 

@@ -34,10 +34,12 @@ def header_camera(row: TextRow) -> tuple[Inner, Inner] | None:
 def photo_camera(row: TextRow, header: tuple[Inner, Inner] | None) -> tuple[Inner, Inner]:
     """The camera of a photograph (number, then ten values), and half a unit of its last decimals:
     the header's if it is the same."""
-    own, half = row.numbers(INNER, 1), _half_units(row.words[1:])
-    if header is not None and (abs(header[0] - own) <= (1 + 1e-9) * half).all():  # a tie is half
+    own_values, half_units = row.numbers(INNER, 1), _half_units(row.words[1:])
+    if (
+        header is not None and (abs(header[0] - own_values) <= (1 + 1e-9) * half_units).all()
+    ):  # a tie is half
         return header
-    return own, half
+    return own_values, half_units
 
 
 def _half_units(words: Sequence[str]) -> Inner:
@@ -72,16 +74,15 @@ def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict[s
 
 
 def rounding_warnings(
-    cameras: Sequence[Camera], half: Float[np.ndarray, "cameras 10"], max_effect: float = 0.1
+    cameras: Sequence[Camera], half_units: Float[np.ndarray, "cameras 10"], max_effect: float = 0.1
 ) -> list[str]:
     """Warnings about cameras whose rounding exceeds `max_effect` pixels in the corner of the
     image; parameters that are 0 or free are not counted.
 
-    **Arguments:** `half` half a unit of the last decimal of each value; `max_effect`: about the
-    precision of a good image point, which rounding should not exceed.
-    """
-    told = []
-    for camera, open in zip(cameras, half):
+    **Arguments:** `half_units` half a unit of the last decimal of each value; `max_effect`: about
+    the precision of a good image point, which rounding should not exceed."""
+    warnings = []
+    for camera, open in zip(cameras, half_units):
         size, pixel = np.array(camera.image_size, float), np.array(camera.pixel_size)
         r = float(np.linalg.norm(size * pixel)) / 2
         # Derivatives of the image in the corner by the parameters, mm: ∂x/∂c = r/c, ∂Δr/∂K1 = r³ ….
@@ -102,9 +103,9 @@ def rounding_warnings(
         if coarse:
             costs = (f"{name} to {cost:.2g} px" for name, cost in coarse.items())
             worst = list_some(costs, as_text=str)
-            told.append(
+            warnings.append(
                 f"the file rounds camera {camera.id!r}: in the corner of the image this leaves "
                 f"open {worst}; give more digits (--set camera.{camera.id}.{next(iter(coarse))}=…) "
                 f"or free them (--set camera.{camera.id}.free={','.join(coarse)})"
             )
-    return told
+    return warnings

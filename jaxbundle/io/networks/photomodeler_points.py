@@ -51,18 +51,18 @@ def renumber_smart(path: Path, objects: PhotoModelerBlock, marks: PhotoModelerBl
     listed: dict[str, list[int]] = {}
     for k, id in enumerate(objects.id):
         listed.setdefault(id, []).append(k)
-    repeated = of_smart & (of_others | {id for id, at in listed.items() if len(at) > 1})
+    repeated = of_smart & (of_others | {id for id, rows in listed.items() if len(rows) > 1})
     if not repeated:
         return ""
-    above = 10 ** max(len(id) for id in (*objects.id, *marks.id))  # above every id
-    other = {id: str(above + int(id)) for id in sorted(repeated, key=int)}
+    factor = 10 ** max(len(id) for id in (*objects.id, *marks.id))  # above every id
+    new_id = {id: str(factor + int(id)) for id in sorted(repeated, key=int)}
     for k in _find_smart_rows(path, objects, listed, repeated, of_smart, of_others):
-        objects.id[k] = other[objects.id[k]]
-    marks.id[:] = [other.get(id, id) if s else id for id, s in zip(marks.id, smart)]
+        objects.id[k] = new_id[objects.id[k]]
+    marks.id[:] = [new_id.get(id, id) if s else id for id, s in zip(marks.id, smart)]
     return (
-        f"{count(len(other), 'smart point')} had the id of another point and "
-        f"{'was' if len(other) == 1 else 'were'} renumbered: "
-        f"{list_some((f'{id} is {new}' for id, new in other.items()), 3, str)}"
+        f"{count(len(new_id), 'smart point')} had the id of another point and "
+        f"{'was' if len(new_id) == 1 else 'were'} renumbered: "
+        f"{list_some((f'{id} is {new}' for id, new in new_id.items()), 3, str)}"
     )
 
 
@@ -76,21 +76,24 @@ def _find_smart_rows(
 ) -> list[int]:
     """The rows of smart points among the object points with a repeated id: the second of two; of
     one, by the neighbouring rows."""
-    twice = {id: at for id, at in listed.items() if id in repeated and len(at) > 1}
-    for id, at in twice.items():
-        if len(at) > 2:
+    rows_of_pairs = {id: rows for id, rows in listed.items() if id in repeated and len(rows) > 1}
+    for id, rows in rows_of_pairs.items():
+        if len(rows) > 2:
             raise InputError(
-                f"{path}, line {objects.line[at[2]]}: point {id!r} is in the object points "
-                f"{len(at)} times; at most a point marked by hand and a smart point have the same "
+                f"{path}, line {objects.line[rows[2]]}: point {id!r} is in the object points "
+                f"{len(rows)} times; at most a point marked by hand and a smart point have the "
+                "same "
                 "id"
             )
-    once = [at[0] for id, at in listed.items() if id in repeated and len(at) == 1]
-    only = lambda ids: [k for id in ids for k in listed.get(id, ())]
+    single_rows = [rows[0] for id, rows in listed.items() if id in repeated and len(rows) == 1]
+    rows_of = lambda ids: [k for id in ids for k in listed.get(id, ())]
     first_smart = min(
-        [at[1] for at in twice.values()] + only(of_smart - of_others - repeated),
+        [rows[1] for rows in rows_of_pairs.values()] + rows_of(of_smart - of_others - repeated),
         default=len(objects),
     )
-    last_other = max([at[0] for at in twice.values()] + only(of_others - of_smart), default=-1)
+    last_other = max(
+        [rows[0] for rows in rows_of_pairs.values()] + rows_of(of_others - of_smart), default=-1
+    )
     # The list has the points marked by hand, ids ascending, then the smart points, ids ascending
     # again: where they descend the first time, the second part begins.
     numbers = [int(id) for id in objects.id]
@@ -102,16 +105,16 @@ def _find_smart_rows(
         ),
         None,
     )
-    smart_rows = [at[1] for at in twice.values()]
-    for k in once:
-        after, before = k > first_smart, k < last_other
-        if after == before and (after or descent is None):
+    smart_rows = [rows[1] for rows in rows_of_pairs.values()]
+    for k in single_rows:
+        is_after, is_before = k > first_smart, k < last_other
+        if is_after == is_before and (is_after or descent is None):
             raise InputError(
                 f"{path}, line {objects.line[k]}: point {objects.id[k]!r} has image points of a "
                 "point marked by hand and of a smart point (σ 0), but is in the object points "
                 "only once, and it is unclear for which; give one of the two another id"
             )
-        if after or (not before and descent is not None and k >= descent):
+        if is_after or (not is_before and descent is not None and k >= descent):
             smart_rows.append(k)
     return smart_rows
 
@@ -121,20 +124,20 @@ def point_table(
 ) -> Columns:
     """Control points as given, then the other object points, then points marked in
     photographs without coordinates."""
-    taken = set(control.id)
-    other = [k for k, id in enumerate(objects.id) if id not in taken]
-    known = taken | set(objects.id)
-    lost = [id for id in dict.fromkeys(marked) if id not in known]
+    control_ids = set(control.id)
+    other_rows = [k for k, id in enumerate(objects.id) if id not in control_ids]
+    known_ids = control_ids | set(objects.id)
+    marked_only = [id for id in dict.fromkeys(marked) if id not in known_ids]
     weighted = np.all(control.values[:, 3:] > 0, axis=1)
-    rest = np.full((len(other) + len(lost), 3), np.nan)
+    blank_rows = np.full((len(other_rows) + len(marked_only), 3), np.nan)
     position = np.concatenate(
-        [control.values[:, :3], objects.values[other, :3], rest[len(other) :]]
+        [control.values[:, :3], objects.values[other_rows, :3], blank_rows[len(other_rows) :]]
     )
-    sigma = np.concatenate([np.where(weighted[:, None], control.values[:, 3:], np.nan), rest])
-    lines = [*control.line, *(objects.line[k] for k in other), *[0] * len(lost)]
+    sigma = np.concatenate([np.where(weighted[:, None], control.values[:, 3:], np.nan), blank_rows])
+    lines = [*control.line, *(objects.line[k] for k in other_rows), *[0] * len(marked_only)]
     columns = {
-        "id": [*control.id, *(objects.id[k] for k in other), *lost],
-        "role": [*np.where(weighted, "control", "fixed").tolist(), *["tie"] * len(rest)],
+        "id": [*control.id, *(objects.id[k] for k in other_rows), *marked_only],
+        "role": [*np.where(weighted, "control", "fixed").tolist(), *["tie"] * len(blank_rows)],
         **dict(zip("XYZ", position.T)),
         **dict(zip(("sX", "sY", "sZ"), sigma.T)),
     }

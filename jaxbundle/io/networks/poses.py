@@ -59,8 +59,8 @@ def are_rotations(
     **Arguments:** `tolerance` of R·Rᵀ relative to the identity: files have six digits or so of R;
     larger, and a matrix with a typing error in its fourth digit passes.
     """
-    off = np.abs(R @ R.mT - np.eye(3)).max((-2, -1))
-    return np.asarray((off <= tolerance) & (np.linalg.det(R) > 0))
+    misfit = np.abs(R @ R.mT - np.eye(3)).max((-2, -1))
+    return np.asarray((misfit <= tolerance) & (np.linalg.det(R) > 0))
 
 
 def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
@@ -69,9 +69,9 @@ def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
     **Raises:** `InputError` beginning with `where`."""
     good = are_rotations(R)
     if not good.all():
-        (first, *_) = np.reshape(R, (-1, 3, 3))[~np.ravel(good)]
+        (first_wrong, *_) = np.reshape(R, (-1, 3, 3))[~np.ravel(good)]
         # Minus a reflection is a rotation.
-        mirror = are_rotations(-first).all()
+        mirror = are_rotations(-first_wrong).all()
         raise InputError(
             f"{where} is not a rotation matrix{', but one that mirrors' if mirror else ''}"
         )

@@ -116,10 +116,10 @@ def read_project(
         if not (oriented and table in OPTIONAL_WHERE_ORIENTED and _is_absent(document, table))
     }
     for table, columns in OPTIONAL_WHERE_ORIENTED.items() if oriented else ():
-        found = tables.get(table)
-        if found is None:
-            found = Columns(dict.fromkeys(columns, ()), Source(table))
-        tables[table] = dataclasses.replace(found, may_be_empty=True)
+        table_found = tables.get(table)
+        if table_found is None:
+            table_found = Columns(dict.fromkeys(columns, ()), Source(table))
+        tables[table] = dataclasses.replace(table_found, may_be_empty=True)
     # Points of a model without image points can be written for other programs.
     if (rays := tables.get("observations")) is not None:
         tables["observations"] = dataclasses.replace(rays, may_be_empty=True)
@@ -131,10 +131,10 @@ def read_project(
 def _resolve_files(document: Document, folder: Path) -> None:
     """Files that sections name are relative to the project."""
     for kind in KINDS.values():
-        for one in document.get(kind.SECTION, {}).values() if kind.FILES else ():
+        for entry in document.get(kind.SECTION, {}).values() if kind.FILES else ():
             for key in kind.FILES:
-                if isinstance(one, dict) and isinstance(one.get(key), str):
-                    one[key] = str(folder / one[key])
+                if isinstance(entry, dict) and isinstance(entry.get(key), str):
+                    entry[key] = str(folder / entry[key])
 
 
 def _is_absent(document: Document, table: str) -> bool:
@@ -282,16 +282,21 @@ def _write_table(
     sigma_header: Sequence[str],
     sigma: Float[np.ndarray, "rows m"],
     words: Mapping[float, str],
-    more: Mapping[str, np.ndarray] = MappingProxyType({}),
+    further_columns: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> None:
-    """Ids, numbers and σ if given; `words` replace special values of σ; `more` columns follow."""
+    """Ids, numbers and σ if given; `words` replace special values of σ; `further_columns` "
+    "columns follow."""
     with_sigma = bool(sigma_header) and not np.isnan(sigma).all()
-    last = zip(*(column.tolist() for column in more.values())) if more else itertools.repeat(())
-    rows = (
-        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()), *rest)
-        for *names, row, s, rest in zip(*ids, values.tolist(), sigma.tolist(), last)
+    further_cells = (
+        zip(*(column.tolist() for column in further_columns.values()))
+        if further_columns
+        else itertools.repeat(())
     )
-    write_csv(path, (*header, *(sigma_header if with_sigma else ()), *more), rows)
+    rows = (
+        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()), *further)
+        for *names, row, s, further in zip(*ids, values.tolist(), sigma.tolist(), further_cells)
+    )
+    write_csv(path, (*header, *(sigma_header if with_sigma else ()), *further_columns), rows)
 
 
 def _cells(
@@ -302,21 +307,21 @@ def _cells(
 
 
 def _document_text(network: Network, origin: str) -> str:
-    said = (*network.warnings, *network.notes)
-    lines = [f"# {' '.join(line.split())}" for line in said]
+    messages = (*network.warnings, *network.notes)
+    lines = [f"# {' '.join(line.split())}" for line in messages]
     # Every σ stands in observations.csv.
     in_tables = "sigma_image", "sigma_origin"
     settings = {key: getattr(network, key) for key in SETTINGS if key not in in_tables}
     if origin != STATED:
         settings["sigma_origin"] = origin
-    further = present_kinds(network)
+    kinds = present_kinds(network)
     distances = ["distances"] * (len(network.distances) > 0)
-    tables = [*REQUIRED_TABLES, *distances, *(f.TABLE for f in further)]
+    tables = [*REQUIRED_TABLES, *distances, *(f.TABLE for f in kinds)]
     settings |= {table: f"{table}.csv" for table in tables}
     if not network.datum_points:
         del settings["datum_points"]
     lines += ["[project]", *assignments(settings)]
-    for kind in further:
+    for kind in kinds:
         if kind.SECTION and kind.settings:
             lines += ["", f"[{kind.SECTION}]", *assignments(kind.settings)]
     return "\n".join(lines) + "\n\n" + cameras_text(network.cameras)

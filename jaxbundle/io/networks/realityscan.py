@@ -111,8 +111,8 @@ class Row(NamedTuple):
 def is_realityscan(path: Path) -> bool:
     """Whether a folder has XMP files of RealityScan, or a file is its table."""
     if path.is_dir():
-        first = next(iter(sorted(path.glob(FILES[0]))), None)
-        return first is not None and NAMESPACE.encode() in beginning(first, 10_000)
+        first_file = next(iter(sorted(path.glob(FILES[0]))), None)
+        return first_file is not None and NAMESPACE.encode() in beginning(first_file, 10_000)
     if path.suffix.lower() != ".csv":
         return False
     # The table may begin with the number of cameras, and its columns may be chosen by the user.
@@ -138,31 +138,31 @@ def read_realityscan(
     **Raises:** `InputError` naming file and field.
     """
     path, unknown = Path(path), UnknownKeys()
-    read = _read_folder if path.is_dir() else _read_table
-    rows = list(read(path, unknown, image_size))
+    read_rows = _read_folder if path.is_dir() else _read_table
+    rows = list(read_rows(path, unknown, image_size))
     if not rows:
         raise InputError(f"{path}: there are no cameras")
     # Each photograph states its own numbers: equal ones are of one camera.
     cameras: dict[tuple, Camera] = {}
-    used = []
+    camera_of_image = []
     for row in rows:
         key = (row.size, tuple(row.parameters.items()))
         if key not in cameras:
             cameras[key] = _camera(str(len(cameras) + 1), row)
-        used.append(cameras[key].id)
+        camera_of_image.append(cameras[key].id)
     names = unique_labels([row.name for row in rows], range(len(rows)))
     images = image_columns(
         Source(str(path), None, "camera"),
         names,
-        used,
+        camera_of_image,
         np.array([row.M for row in rows]),
         np.array([row.X0 for row in rows]),
     )
-    told = [*unknown.messages(), *fit_messages(cameras.values())]
+    messages = [*unknown.messages(), *fit_messages(cameras.values())]
     if any(row.parameters[name] for row in rows for name in TANGENTIAL):
-        told.append("t1 and t2 are taken as p1 and p2 of OpenCV")
+        messages.append("t1 and t2 are taken as p1 and p2 of OpenCV")
     document = foreign_document(path.stem, map(entry_of, cameras.values()))
-    return assemble(path, document, overrides, images, warnings=told)
+    return assemble(path, document, overrides, images, warnings=messages)
 
 
 def _camera(id: str, row: Row) -> Camera:
@@ -182,19 +182,19 @@ def _camera(id: str, row: Row) -> Camera:
 
 
 def _size(
-    folder: Path, name: str, given: Sequence[float] | None, where: str
+    folder: Path, name: str, given_size: Sequence[float] | None, where: str
 ) -> tuple[tuple[int, int], str]:
     """The size of a photograph, and its name with suffix if it is beside."""
     # XMP files have the stem of their photograph only
     for file in (folder / name, *(folder / f"{name}{suffix}" for suffix in PHOTOGRAPHS)):
         if file.suffix.lower() in PHOTOGRAPHS and file.is_file():
             return photograph_size(file), file.name
-    if given is None:
+    if given_size is None:
         raise InputError(
             f"{where}: the size of the photograph is missing; expected {name} beside it, or "
             "--image-size W,H (convert, camera)"
         )
-    w, h = (int(n) for n in given)
+    w, h = (int(n) for n in given_size)
     return (w, h), name
 
 
@@ -202,15 +202,15 @@ def _size(
 
 
 def _read_folder(
-    folder: Path, unknown: UnknownKeys, given: Sequence[float] | None
+    folder: Path, unknown: UnknownKeys, given_size: Sequence[float] | None
 ) -> Iterator[Row]:
     for path in sorted(folder.glob(FILES[0])):
         fields = _fields(path)
         if not fields:
             continue  # of another program
-        own = fields.pop(OWN_NAME, path.stem)
+        own_name = fields.pop(OWN_NAME, path.stem)
         unknown.check(fields, XMP_KEYS, path)
-        size, name = _size(folder, own, given, str(path))
+        size, name = _size(folder, own_name, given_size, str(path))
         yield Row(name, size, _interior(path, fields), *_pose(path, fields), str(path))
 
 
@@ -221,12 +221,12 @@ def _fields(path: Path) -> dict[str, str]:
         return {}
     fields = {}
     # The namespaces of elements are removed by the reader: their names are those of the file.
-    own = {*re.findall(r"<xcr:(\w+)", text)}
+    own_names = {*re.findall(r"<xcr:(\w+)", text)}
     for element in read_xml(path).iter():
         for key, value in element.attrib.items():
             if key.startswith(f"{{{NAMESPACE}}}") or key == f"{{{MEDIA}}}{OWN_NAME}":
                 fields[key.rpartition("}")[2]] = value
-        if element.tag in own:
+        if element.tag in own_names:
             fields[element.tag] = element.text or ""
     return fields
 
@@ -254,9 +254,9 @@ def _interior(path: Path, fields: Mapping[str, str]) -> dict[str, float]:
     k = np.zeros(6)
     if model != "perspective" and "DistortionCoeficients" in fields:
         k = _numbers(path, fields, "DistortionCoeficients", 6)
-    found = {"f": number("FocalLength35mm", "0")}
-    found |= {"px": number("PrincipalPointU", "0"), "py": number("PrincipalPointV", "0")}
-    return found | dict(zip((*RADIAL, *TANGENTIAL), k.tolist()))
+    fields_found = {"f": number("FocalLength35mm", "0")}
+    fields_found |= {"px": number("PrincipalPointU", "0"), "py": number("PrincipalPointV", "0")}
+    return fields_found | dict(zip((*RADIAL, *TANGENTIAL), k.tolist()))
 
 
 def _pose(path: Path, fields: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray]:
@@ -275,7 +275,9 @@ def _names(line: str) -> list[str]:
     return [name.strip().lstrip("#").strip().lower() for name in line.split(",")]
 
 
-def _read_table(path: Path, unknown: UnknownKeys, given: Sequence[float] | None) -> Iterator[Row]:
+def _read_table(
+    path: Path, unknown: UnknownKeys, given_size: Sequence[float] | None
+) -> Iterator[Row]:
     # Its header begins with #, as comments of our tables do.
     text = re.sub(r"^\s*#\s*(?=name\s*,)", "", read_text(path), count=1, flags=re.M | re.I)
     table = parse_csv(path, text)
@@ -290,7 +292,7 @@ def _read_table(path: Path, unknown: UnknownKeys, given: Sequence[float] | None)
     }
     for k, name in enumerate(names):
         where = table.source(k)
-        size, photograph = _size(path.parent, name, given, where)
+        size, photograph = _size(path.parent, name, given_size, where)
         parameters = {key: float(column[k]) for key, column in interior.items()}
         M = _from_heading(*np.radians(pose[k, 3:])).T
         yield Row(photograph, size, parameters, M, pose[k, :3], where)
@@ -320,24 +322,25 @@ def _heading_of(R: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
 # --- writing --------------------------------------------------------------------------------
 
 
-def _written(camera: Camera, largest_difference: float = 0.5) -> dict[str, float]:
+def _as_written(camera: Camera, largest_difference: float = 0.5) -> dict[str, float]:
     """The interior orientation in the units of the program; `largest_difference`: what one focal
     length instead of two may change, pixels: rounding to whole ones does as much."""
     p = check_others_zero(camera, "RealityScan", ("k1", "k2", "k3", "p1", "p2"))
     w, h = size_of(camera, "RealityScan")
     # An adjusted camera has two focal lengths that differ by their σ.
-    f, off = math.sqrt(p["fx"] * p["fy"]), _focal_difference(camera)
-    if off > largest_difference:
+    f, difference = math.sqrt(p["fx"] * p["fy"]), _focal_difference(camera)
+    if difference > largest_difference:
         raise InputError(
             f"camera {camera.id!r}: RealityScan has one focal length, but fx is {p['fx']:.9g} and "
-            f"fy {p['fy']:.9g}, {off:.2g} px at the edge of the image; adjust the camera with "
+            f"fy {p['fy']:.9g}, {difference:.2g} px at the edge of the image; adjust the camera "
+            "with "
             'tie = [["fx", "fy"]]'
         )
     side = max(w, h)
-    found = {"f": f / side * SMALL_FORMAT[0]}
-    found |= {"px": (p["cx"] + PIXEL_CENTRE - w / 2) / side}
-    found |= {"py": (p["cy"] + PIXEL_CENTRE - h / 2) / side}
-    return found | {"k1": p["k1"], "k2": p["k2"], "k3": p["k3"], "k4": 0.0} | {
+    fields_written = {"f": f / side * SMALL_FORMAT[0]}
+    fields_written |= {"px": (p["cx"] + PIXEL_CENTRE - w / 2) / side}
+    fields_written |= {"py": (p["cy"] + PIXEL_CENTRE - h / 2) / side}
+    return fields_written | {"k1": p["k1"], "k2": p["k2"], "k3": p["k3"], "k4": 0.0} | {
         "t1": p["p1"], "t2": p["p2"]
     }  # fmt: skip
 
@@ -350,9 +353,9 @@ def _focal_difference(camera: Camera) -> float:
 
 
 def _losses(network: Network) -> tuple[str, ...]:
-    off = max((_focal_difference(camera) for camera in network.cameras), default=0.0)
-    one = f"the difference of fx and fy (largest change in an image {off:.2g} px)"
-    return (*describe_losses(network, REALITYSCAN_LOSSES), *([one] if off else []))
+    largest_difference = max((_focal_difference(camera) for camera in network.cameras), default=0.0)
+    loss = f"the difference of fx and fy (largest change in an image {largest_difference:.2g} px)"
+    return (*describe_losses(network, REALITYSCAN_LOSSES), *([loss] if largest_difference else []))
 
 
 def write_realityscan_csv(network: Network, path: str | Path) -> tuple[str, ...]:
@@ -363,7 +366,7 @@ def write_realityscan_csv(network: Network, path: str | Path) -> tuple[str, ...]
     """
     need_values(network, "opencv", "RealityScan", points=False)
     images = network.images
-    interior = [_written(camera) for camera in network.cameras]
+    interior = [_as_written(camera) for camera in network.cameras]
     rows = [
         (id, *X0, *_heading_of(M.T), *(interior[c][key] for key in HEADER[len(POSE) + 1 :]))
         for id, X0, M, c in zip(
@@ -403,7 +406,7 @@ def fill_realityscan(network: Network, folder: Path) -> tuple[str, ...]:
     twice = next((name for name in names if names.count(name) > 1 or not name.strip(".")), None)
     if twice is not None:
         raise InputError(f"{folder}: image {twice!r} does not give a unique file name")
-    interior = [_written(camera) for camera in network.cameras]
+    interior = [_as_written(camera) for camera in network.cameras]
     R = flip_rows(matrices_of(images.angles))
     texts = [
         _xmp(id, interior[c], rotation, X0, c)

@@ -91,8 +91,8 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         if row["converged"] is not True:
             raise InputError(f"{where}: was not solved ({row['status']})")
         mountings = {
-            label.rpartition(" of ")[0]: {name: x["value"] for name, x in found.items()}
-            for label, found in row["further_unknowns"]["mounting"].items()
+            label.rpartition(" of ")[0]: {name: x["value"] for name, x in estimates.items()}
+            for label, estimates in row["further_unknowns"]["mounting"].items()
         }
         cameras, pixel = [], row.get("settings", {}).get("pixel_size")
         for id in mountings:
@@ -105,8 +105,8 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
-        raise InputError(f"{where}: not a line of jaxbundle batch --rig: {what}") from None
+        fault = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{where}: not a line of jaxbundle batch --rig: {fault}") from None
     return network_of_rig(file, cameras, turns, bases, overrides)
 
 
@@ -146,8 +146,8 @@ def read_rig_result(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
-        raise InputError(f"{path}: not the result of calibrate --rig: {what}") from None
+        fault = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{path}: not the result of calibrate --rig: {fault}") from None
     for turn in turns:
         check_rotations(turn, f"{path}: rig.mountings, rotation")
     return network_of_rig(path, cameras, turns, bases, overrides)

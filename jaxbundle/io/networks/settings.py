@@ -68,29 +68,29 @@ def apply_overrides(
 
 def _known_keys(key: str, keys: Sequence[str]) -> str:
     """The end of a message about an unknown key: all of them, and the probable one."""
-    section, dot, rest = key.partition(".")
-    known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
+    section, dot, after_dot = key.partition(".")
+    known_keys = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
     close = closest_name(section, ("camera", *SECTIONS) if dot else (*keys, "free"))
-    meant = "" if close is None else f"; did you mean {f'{close}{dot}{rest}'!r}?"
-    return f"; known: {', '.join(known)}{meant}"
+    suggestion = "" if close is None else f"; did you mean {f'{close}{dot}{after_dot}'!r}?"
+    return f"; known: {', '.join(known_keys)}{suggestion}"
 
 
 def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
     """Apply a setting to the camera named by the key, or to all cameras."""
-    rest = key.removeprefix("camera.")
+    after_camera = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
     # The longest id first: "a.b" may be an id beside "a".
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
-        if rest.startswith(f"{ids[c]}."):
-            _override_camera(cameras[c], key, rest.removeprefix(f"{ids[c]}."), text)
+        if after_camera.startswith(f"{ids[c]}."):
+            _override_camera(cameras[c], key, after_camera.removeprefix(f"{ids[c]}."), text)
             return
-    if not rest.startswith(f"{ALL_CAMERAS}."):
+    if not after_camera.startswith(f"{ALL_CAMERAS}."):
         raise InputError(
             f"--set {key}: no such camera; known: "
             f"{list_some((f'camera.{id}.PARAMETER' for id in (*ids, ALL_CAMERAS)), 12, str)}"
         )
     for camera in cameras:
-        _override_camera(camera, key, rest.removeprefix(f"{ALL_CAMERAS}."), text)
+        _override_camera(camera, key, after_camera.removeprefix(f"{ALL_CAMERAS}."), text)
 
 
 def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
@@ -130,8 +130,8 @@ def _override_section(document: Document, key: str, text: str) -> None:
     except ValueError:
         values = words
     # A list of one is still a list.
-    several = name == "free" or text.startswith("[") or len(values) != 1
-    settings[name] = values if several else values[0]
+    is_list = name == "free" or text.startswith("[") or len(values) != 1
+    settings[name] = values if is_list else values[0]
 
 
 def _words(text: str) -> list[str]:

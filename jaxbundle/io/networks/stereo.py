@@ -96,20 +96,20 @@ def rectify(
         raise InputError("both cameras are at one position; expected a base between them")
     base = -R.T @ T / length  # from the first to the second, in the first's frame
     k = int(np.abs(base[:2]).argmax())  # the axis along the base, pointing as the camera's own
-    first = base * np.sign(base[k])
+    new_axis = base * np.sign(base[k])
     axes = np.array([[0, 0, 1.0], R[2]])  # both optical axes, in the first's frame
     z = axes.sum(0)
-    z = z - (z @ first) * first
+    z = z - (z @ new_axis) * new_axis
     # Each optical axis needs an image in the common plane, so that it is less than 90° from z.
     # 1e-6, of unit vectors: rounding of a base along an axis, and of opposite axes.
-    if not first.any() or (axes @ z <= 1e-6).any():
+    if not new_axis.any() or (axes @ z <= 1e-6).any():
         raise InputError(
             "one camera looks along the base or away from the other; they have no common "
             "rectified image"
         )
     z = z / np.linalg.norm(z)
     # Right-handed: x × y = z, whichever of both lies along the base.
-    rows = [first, np.cross(z, first)] if k == 0 else [np.cross(first, z), first]
+    rows = [new_axis, np.cross(z, new_axis)] if k == 0 else [np.cross(new_axis, z), new_axis]
     R1 = np.stack([*rows, z])
     R2 = R1 @ R.T
     p = [all_parameters(camera) for camera in cameras]
@@ -131,28 +131,30 @@ def _file_names(cameras: Sequence[Camera]) -> list[str]:
     folded = [name.casefold() for name in names]
     for k, name in enumerate(folded):
         if name in folded[:k]:
-            both = f"{cameras[folded.index(name)].id!r} and {cameras[k].id!r}"
-            raise InputError(f"the names of the cameras {both} give the same file {names[k]}.yaml")
+            both_names = f"{cameras[folded.index(name)].id!r} and {cameras[k].id!r}"
+            raise InputError(
+                f"the names of the cameras {both_names} give the same file {names[k]}.yaml"
+            )
     return names
 
 
-def _pairs(network: Network, what: str) -> list[StereoPair]:
+def _pairs(network: Network, subject: str) -> list[StereoPair]:
     """Every camera with the first.
 
     **Raises:** `InputError` for a single camera, and for cameras without mountings."""
     cameras = network.cameras
     if len(cameras) < 2:
-        raise InputError(f"{what} holds two cameras, got {len(cameras)}")
+        raise InputError(f"{subject} holds two cameras, got {len(cameras)}")
     mountings = mountings_of(network)
     if mountings is None:
         raise InputError(
-            f"{what} holds the mounting of two cameras; expected a rig, or one image of each"
+            f"{subject} holds the mounting of two cameras; expected a rig, or one image of each"
         )
     names, T, pairs = _file_names(cameras), np.eye(4), []
     for camera, name, step in zip(cameras[1:], names[1:], mountings):
         T = step @ T  # from the first camera to this one
-        own = f"{names[0]}_{name}" if len(cameras) > 2 else ""
-        pairs.append(StereoPair((cameras[0], camera), T[:3, :3], T[:3, 3], own))
+        pair_name = f"{names[0]}_{name}" if len(cameras) > 2 else ""
+        pairs.append(StereoPair((cameras[0], camera), T[:3, :3], T[:3, 3], pair_name))
     return pairs
 
 
@@ -180,19 +182,19 @@ def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
     """
     path = Path(path)
     pairs = _pairs(network, "a stereo file of OpenCV")
-    texts, lost = [], []
+    texts, losses = [], []
     for pair in pairs:
         entries = _stereo_entries(pair)
         try:
             rectified = rectify(*pair[:3])
         except InputError as error:
-            lost.append(f"rectification of {pair}: {error}")
+            losses.append(f"rectification of {pair}: {error}")
         else:
             entries |= {name: (*M.shape, M.ravel()) for name, M in rectified._asdict().items()}
             entries |= {"Q": (4, 4, rectified.Q.ravel())}
         texts.append(file_text(entries, path.suffix.lower() == ".json"))
     write_texts([_file_of(pair, path) for pair in pairs], texts)
-    return (*describe_losses(network, STEREO_LOSSES), *lost)
+    return (*describe_losses(network, STEREO_LOSSES), *losses)
 
 
 def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
@@ -201,12 +203,19 @@ def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
         raise InputError(f"a stereo file of OpenCV has one camera model, got {', '.join(kinds)}")
     entries: dict[str, Any] = {}
     for k, camera in enumerate(pair.cameras, 1):
-        own = opencv_entries(camera)
+        entries_of_camera = opencv_entries(camera)
         names = NAMES[2 * k - 2 : 2 * k]
         w, h = size_of(camera, "OpenCV")
         entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
-        entries |= dict(zip(names, (own["camera_matrix"], own["distortion_coefficients"])))
-        entries |= {name: own[name] for name in FISHEYE_ENTRIES if name in own}
+        entries |= dict(
+            zip(
+                names,
+                (entries_of_camera["camera_matrix"], entries_of_camera["distortion_coefficients"]),
+            )
+        )
+        entries |= {
+            name: entries_of_camera[name] for name in FISHEYE_ENTRIES if name in entries_of_camera
+        }
     return entries | {"R": (3, 3, pair.R.ravel()), "T": (3, 1, pair.T)}
 
 
@@ -223,22 +232,22 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
     **Returns, raises:** as `write_opencv_stereo`; `InputError` if no pair can be rectified.
     """
     pairs = _pairs(network, "a pair of ROS")
-    texts, refused = {}, []
+    texts, refusals = {}, []
     for pair in pairs:
         try:
             rectified = rectify(*pair[:3])
         except InputError as error:
-            refused.append(f"pair of {pair}: {error}")
+            refusals.append(f"pair of {pair}: {error}")
             continue
         parts = ((rectified.R1, rectified.P1), (rectified.R2, rectified.P2))
         for camera, name, part in zip(pair.cameras, _file_names(pair.cameras), parts):
             texts[folder / pair.name / f"{name}.yaml"] = ros_text(camera, *part)
     if not texts:
-        raise InputError("; ".join(refused))
+        raise InputError("; ".join(refusals))
     for file in texts:
         file.parent.mkdir(parents=True, exist_ok=True)
     write_texts([*texts], [*texts.values()])
-    return (*describe_losses(network, STEREO_LOSSES), *refused)
+    return (*describe_losses(network, STEREO_LOSSES), *refusals)
 
 
 def is_ros_stereo(path: Path) -> bool:
@@ -288,11 +297,11 @@ def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(f"{path}: {len(parts)} cameras; expected two")
     # The one without a shift is the first, whatever the files are called.
     parts.sort(key=lambda part: bool(part[2].any()))
-    (left, R1, none), (right, R2, shift) = parts
-    if none.any() or not shift.any():
+    (left, R1, no_shift), (right, R2, shift) = parts
+    if no_shift.any() or not shift.any():
         raise InputError(
             f"{path}: expected the projection_matrix of one camera with and of the other without "
-            f"a shift in its last column, got {'two' if none.any() else 'none'} with"
+            f"a shift in its last column, got {'two' if no_shift.any() else 'none'} with"
         )
     turns, shifts = [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift]
     return rig_network(path, [left, right], turns, shifts, overrides, fit_messages([left, right]))

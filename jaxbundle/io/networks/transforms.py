@@ -129,7 +129,7 @@ def read_transforms(
     if image_size is not None and file.get("w") is None and file.get("h") is None:
         file.document |= dict(zip("wh", image_size))
     cameras: dict[str, Camera] = {}
-    names, used, M, X0, lost = [], [], [], [], []
+    names, camera_of_frame, M, X0, lost_frames = [], [], [], [], []
     why = None
     for frame in file.rows("frames"):
         unknown.check(frame.document, FRAME_KEYS, frame.path)
@@ -140,14 +140,14 @@ def read_transforms(
             if key not in cameras:
                 cameras[key] = _camera(str(len(cameras) + 1), fields)
         except NoPlaceError as error:
-            why, lost = error, [*lost, name]
+            why, lost_frames = error, [*lost_frames, name]
             continue
         T = frame.array("transform_matrix", (None, 4))
         if len(T) not in (3, 4):
             raise InputError(f"{frame.path}: transform_matrix has {len(T)} rows; expected 4")
         check_rotations(T[:3, :3], f"{frame.path}: transform_matrix")
         names.append(name)
-        used.append(cameras[key].id)
+        camera_of_frame.append(cameras[key].id)
         # The file has camera → world, M world → camera.
         M.append(T[:3, :3].T)
         X0.append(T[:3, 3])
@@ -156,27 +156,37 @@ def read_transforms(
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
         raise InputError(f"{path}: two frames have the file_path {twice!r}")
-    told = [f"{why}; left out {count(len(lost), 'frame')}: {list_some(lost)}"] if lost else []
-    told += unknown.messages()
-    images = image_columns(Source(str(path), None, "frame"), names, used, np.array(M), np.array(X0))
+    messages = (
+        [f"{why}; left out {count(len(lost_frames), 'frame')}: {list_some(lost_frames)}"]
+        if lost_frames
+        else []
+    )
+    messages += unknown.messages()
+    images = image_columns(
+        Source(str(path), None, "frame"), names, camera_of_frame, np.array(M), np.array(X0)
+    )
     document = foreign_document(path.stem, map(entry_of, cameras.values()))
     return assemble(
-        path, document, overrides, images, warnings=(*told, *fit_messages(cameras.values()))
+        path, document, overrides, images, warnings=(*messages, *fit_messages(cameras.values()))
     )
 
 
 def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
     """The camera fields of a frame, missing ones from the file."""
-    own = any(name in frame.document for name in (*INTRINSICS, *OTHER_NAMES.values()))
+    has_own = any(name in frame.document for name in (*INTRINSICS, *OTHER_NAMES.values()))
     values = {}
     for source in (file, frame):  # the frame's own replace those of the file
         for name in INTRINSICS:
-            given = [k for k in (name, OTHER_NAMES.get(name, name)) if source.get(k) is not None]
-            if len({str(source.get(k)) for k in given}) > 1:
-                raise InputError(f"{source.path}: {' and '.join(given)} differ; expected one")
-            if given:
-                values[name] = source.get(given[0])
-    return JsonFields(frame.path if own else file.path, values)
+            spellings_given = [
+                k for k in (name, OTHER_NAMES.get(name, name)) if source.get(k) is not None
+            ]
+            if len({str(source.get(k)) for k in spellings_given}) > 1:
+                raise InputError(
+                    f"{source.path}: {' and '.join(spellings_given)} differ; expected one"
+                )
+            if spellings_given:
+                values[name] = source.get(spellings_given[0])
+    return JsonFields(frame.path if has_own else file.path, values)
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
@@ -192,17 +202,17 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if fields.get("w") is not None or fields.get("h") is not None:
         size = fields.integer("w", least=1), fields.integer("h", least=1)
     # Either axis may be the one that is given.
-    first, other = "xy" if any(fields.get(f"{n}_x") is not None for n in FOCAL) else "yx"
+    given_axis, other_axis = "xy" if any(fields.get(f"{n}_x") is not None for n in FOCAL) else "yx"
     side = dict(zip("xy", size or (None, None)))
-    f = {first: _focal_length(fields, first, side[first], None)}
-    f[other] = _focal_length(fields, other, side[other], f[first])
+    f = {given_axis: _focal_length(fields, given_axis, side[given_axis], None)}
+    f[other_axis] = _focal_length(fields, other_axis, side[other_axis], f[given_axis])
     fx, fy = f["x"], f["y"]
     c = [_principal_point(fields, axis, side[axis]) - PIXEL_CENTRE for axis in "xy"]
     core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))
     coefficients = {name: fields.number(name, 0.0) for name in names}
     k4 = fields.number("k4", 0.0) if kind == "OPENCV" else 0.0
     if k4 == 0:
-        tie = (("fx", "fy"),) if fields.get(f"fl_{other}") is None and fx == fy else ()
+        tie = (("fx", "fy"),) if fields.get(f"fl_{other_axis}") is None and fx == fy else ()
         return Camera(id, model, core | coefficients, image_size=size, tie=tie)
     if size is None:
         raise InputError(f"{fields.path}: w is missing; k4 is not 0: a fit needs the image size")
@@ -211,7 +221,9 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     return fit_camera(id, foreign, str(fields.path), f"has k4 {k4:g}")
 
 
-def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float | None) -> float:
+def _focal_length(
+    fields: JsonFields, axis: str, size: int | None, other_length: float | None
+) -> float:
     """Focal length along an axis: given, from the angle of view, or that of the other axis."""
     if fields.get(f"fl_{axis}") is None and fields.get(f"camera_angle_{axis}") is not None:
         if size is None:
@@ -220,12 +232,12 @@ def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float 
                 "them in the file, or --image-size W,H (convert, camera)"
             )
         return size / 2 / np.tan(fields.number(f"camera_angle_{axis}") / 2)
-    if other is None and fields.get(f"fl_{axis}") is None:
+    if other_length is None and fields.get(f"fl_{axis}") is None:
         raise InputError(
             f"{fields.path}: fl_x and camera_angle_x are missing; expected one of them, or fl_y, "
             "camera_angle_y"
         )
-    return fields.number(f"fl_{axis}", other)
+    return fields.number(f"fl_{axis}", other_length)
 
 
 def _principal_point(fields: JsonFields, axis: str, size: int | None) -> float:

@@ -48,8 +48,8 @@ class Checkpoint:
         head = self._file.read(RECORD.size)
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if len(head) == RECORD.size:
-            found, length, check = RECORD.unpack(head)
-            if found == number and length in (0, size):
+            number_found, length, check = RECORD.unpack(head)
+            if number_found == number and length in (0, size):
                 content = self._file.read(length)
                 if len(content) == length and zlib.crc32(content) == check:
                     values = np.frombuffer(content, dtype)
@@ -90,19 +90,19 @@ def keep_blocks(path: Path | None, fingerprint: str) -> Iterator[Checkpoint | No
         except OSError as error:
             raise unwritable(path, error) from None
         with file:
-            found = file.read(len(header))
-            if found and not header.startswith(found):
-                known = found.startswith(HEADER.encode())
+            header_found = file.read(len(header))
+            if header_found and not header.startswith(header_found):
+                is_known = header_found.startswith(HEADER.encode())
                 raise InputError(
                     f"--checkpoint {path}: "
                     + (
                         "has blocks of another map: other inputs or options; repeat these, remove "
                         "the file, or give another"
-                        if known
+                        if is_known
                         else "is a file of something else; give another name"
                     )
                 )
-            if found != header:
+            if header_found != header:
                 file.seek(0)
                 file.write(header)
             yield Checkpoint(path, file)

@@ -171,8 +171,8 @@ def write_corrected(
         pixels = _SourcePixels(source, bands, correction)
 
         def block(nodes: MapNodes) -> np.ndarray | None:
-            given = image, search, surface, nodes
-            places = block_places(*given, correction.occlusion, correction.tolerance)
+            geometry = image, search, surface, nodes
+            places = block_places(*geometry, correction.occlusion, correction.tolerance)
             return None if places is None else pixels.at(image, places)
 
         format, checkpoint = stored
@@ -200,36 +200,44 @@ class _SourcePixels:
         flags = raster.mask_flag_enums
         values = set(raster.nodatavals)
         self._missing = next(iter(values)) if len(values) == 1 else None
-        one = all([flag.name for flag in band] == ["nodata"] for band in flags)
-        none = all([flag.name for flag in band] == ["all_valid"] for band in flags)
-        self._masked = not (none or (one and self._missing is not None))
-        if none:
+        is_nodata_only = all([flag.name for flag in band] == ["nodata"] for band in flags)
+        is_all_valid = all([flag.name for flag in band] == ["all_valid"] for band in flags)
+        self._masked = not (is_all_valid or (is_nodata_only and self._missing is not None))
+        if is_all_valid:
             self._missing = None
-        given = correction.nodata if correction.nodata is not None else self._missing
-        if given is not None and as_type(np.array(given), dtype) != given and not np.isnan(given):
-            raise InputError(f"--nodata {given:g}: {path} has values of {dtype}; give one of these")
-        if given is not None and np.isnan(given) and dtype.kind != "f":
-            raise InputError(f"--nodata {given:g}: {path} has values of {dtype}; give one of these")
+        nodata = correction.nodata if correction.nodata is not None else self._missing
+        if (
+            nodata is not None
+            and as_type(np.array(nodata), dtype) != nodata
+            and not np.isnan(nodata)
+        ):
+            raise InputError(
+                f"--nodata {nodata:g}: {path} has values of {dtype}; give one of these"
+            )
+        if nodata is not None and np.isnan(nodata) and dtype.kind != "f":
+            raise InputError(
+                f"--nodata {nodata:g}: {path} has values of {dtype}; give one of these"
+            )
         self.bands = MapBands(
             raster.count,
             str(dtype),
-            given,
+            nodata,
             tuple(name or "" for name in raster.descriptions),
             (raster.scales, raster.offsets),
             raster.colorinterp,
         )
-        self._keeps_apart = given is not None and dtype.kind != "f"
+        self._keeps_apart = nodata is not None and dtype.kind != "f"
 
     def at(self, image: PushbroomImage | RpcImage, places: Places) -> np.ndarray | None:
         """The values [bands, rows, columns] of all bands at the positions of a block; None if
         no data."""
         line, pixel = map(np.asarray, places)
         dtype = np.dtype(self.bands.dtype)
-        found = np.full((*line.shape, self.bands.count), self.bands.missing, dtype)
+        values_found = np.full((*line.shape, self.bands.count), self.bands.missing, dtype)
         # 2²² values of all bands are at most 32 MB in memory for each of the two workers
-        most, reach = 2**22 / self.bands.count, REACH[self._kind]
-        seen = False
-        for part, window in _parts(line, pixel, image, most, reach):
+        max_pixels, reach = 2**22 / self.bands.count, REACH[self._kind]
+        has_values = False
+        for part, window in _parts(line, pixel, image, max_pixels, reach):
             pixels = self._read(window)
             (top, _), (left, _) = window
             values, any_ = _resample(
@@ -241,9 +249,9 @@ class _SourcePixels:
                 self.bands.missing,
                 (line[part] - top, pixel[part] - left),
             )
-            found[part] = values
-            seen |= bool(any_)
-        return np.moveaxis(found, -1, 0) if seen else None
+            values_found[part] = values
+            has_values |= bool(any_)
+        return np.moveaxis(values_found, -1, 0) if has_values else None
 
     def _read(self, window: Window) -> np.ndarray:
         """The pixels [rows, columns, bands] of a window, NaN where they are masked.
@@ -285,47 +293,48 @@ def _resample(
         lambda: resample_pixels(jnp.where(lacking, jnp.nan, pixels.astype(working)), *place, kind),
         lambda: resample_pixels(pixels, *place, kind),
     )
-    known = ~jnp.isnan(values)
+    is_known = ~jnp.isnan(values)
     if np.dtype(dtype).kind == "f":
-        return jnp.where(known, values, missing).astype(dtype), jnp.any(known)
+        return jnp.where(is_known, values, missing).astype(dtype), jnp.any(is_known)
     limits = np.iinfo(dtype)
-    whole = jnp.clip(jnp.round(values), float(limits.min), float(limits.max))
+    rounded = jnp.clip(jnp.round(values), float(limits.min), float(limits.max))
     if keeps_apart:
         beside = jnp.where(missing < limits.max, missing + 1, missing - 1)
-        whole = jnp.where(whole == missing, beside, whole)
-    return jnp.where(known, whole, missing).astype(dtype), jnp.any(known)
+        rounded = jnp.where(rounded == missing, beside, rounded)
+    return jnp.where(is_known, rounded, missing).astype(dtype), jnp.any(is_known)
 
 
 def _parts(
     line: Float[np.ndarray, "rows columns"],
     pixel: Float[np.ndarray, "rows columns"],
     image: PushbroomImage | RpcImage,
-    most: float,
+    max_pixels: float,
     reach: int,
     part: Part = (slice(0, BLOCK_SIZE), slice(0, BLOCK_SIZE)),
 ) -> Iterator[tuple[Part, Window]]:
-    """Quarters of a block, quartered again until each covers at most `most` pixels of the image.
+    """Quarters of a block, quartered again until each covers at most `max_pixels` pixels of the
+    image.
 
     Each as slices of the block, with the required rows and columns of the image. Parts outside the
     image are left out.
     """
-    seen = line[part], pixel[part]
-    if not np.isfinite(seen[0]).any():
+    places_of_part = line[part], pixel[part]
+    if not np.isfinite(places_of_part[0]).any():
         return
     # One pixel more than the kernel reaches, for rounding.
     margin = reach + 1
     lines, pixels = (
         (max(int(np.nanmin(v)) - margin, 0), min(int(np.nanmax(v)) + margin + 1, size))
-        for v, size in zip(seen, (image.lines, image.pixels))
+        for v, size in zip(places_of_part, (image.lines, image.pixels))
     )
     window = lines, pixels
     side = part[0].stop - part[0].start
     # A single place cannot be halved, whatever it needs.
-    if side == 1 or (lines[1] - lines[0]) * (pixels[1] - pixels[0]) <= most:
+    if side == 1 or (lines[1] - lines[0]) * (pixels[1] - pixels[0]) <= max_pixels:
         yield part, window
         return
     halves = [
         [slice(s.start, s.start + side // 2), slice(s.start + side // 2, s.stop)] for s in part
     ]
     for rows, columns in itertools.product(*halves):
-        yield from _parts(line, pixel, image, most, reach, (rows, columns))
+        yield from _parts(line, pixel, image, max_pixels, reach, (rows, columns))

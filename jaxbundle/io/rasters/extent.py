@@ -89,16 +89,16 @@ def rpc_extent(rpc: Rpc) -> Extent | None:
 
 def joint_extent(extents: Sequence[Extent | None]) -> Extent | None:
     """The extent of several images; None if one has none."""
-    known = [extent for extent in extents if extent is not None]
-    if len(known) < len(extents) or not known:
+    known_extents = [extent for extent in extents if extent is not None]
+    if len(known_extents) < len(extents) or not known_extents:
         return None
     # The turn that brings each nearest to the first.
-    turns = [360 * round((known[0].west - extent.west) / 360) for extent in known]
+    turns = [360 * round((known_extents[0].west - extent.west) / 360) for extent in known_extents]
     return Extent(
-        min(extent.west + turn for extent, turn in zip(known, turns)),
-        min(extent.south for extent in known),
-        max(extent.east + turn for extent, turn in zip(known, turns)),
-        max(extent.north for extent in known),
+        min(extent.west + turn for extent, turn in zip(known_extents, turns)),
+        min(extent.south for extent in known_extents),
+        max(extent.east + turn for extent, turn in zip(known_extents, turns)),
+        max(extent.north for extent in known_extents),
     )
 
 

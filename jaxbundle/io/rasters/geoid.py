@@ -33,10 +33,10 @@ def add_geoid(terrain: Terrain, geoid: Path) -> Terrain:
         for k in (0, 1)
     )
     N = undulations(geoid, longitude, latitude)
-    missing = np.isnan(N)
-    missing &= np.isfinite(heights)
-    if missing.any():
-        row, column = np.argwhere(missing)[0]
+    is_missing = np.isnan(N)
+    is_missing &= np.isfinite(heights)
+    if is_missing.any():
+        row, column = np.argwhere(is_missing)[0]
         raise InputError(
             f"{geoid}: no height of the geoid at longitude {longitude[column]:.6g}°, latitude "
             f"{latitude[row]:.6g}°; give a geoid that covers the terrain model"
@@ -72,18 +72,18 @@ def _in_parts(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     longitude: Float[np.ndarray, "*#shape"],
     latitude: Float[np.ndarray, "*#shape"],
-    together: int = 1 << 18,
+    points_at_once: int = 1 << 18,
 ) -> Float[np.ndarray, "*shape"]:
-    """A function of points, about as many `together`: interpolation has a dozen arrays of their
-    number, for 2¹⁸ points 25 MB."""
+    """A function of points, about as many `points_at_once`: interpolation has a dozen arrays of
+    their number, for 2¹⁸ points 25 MB."""
     shape = np.broadcast_shapes(longitude.shape, latitude.shape)
     out = np.empty(shape)
-    if out.size <= together:
+    if out.size <= points_at_once:
         out[...] = function(longitude, latitude)
         return out
-    rows = max(1, together // (out.size // shape[0]))
-    for first in range(0, shape[0], rows):
-        part = slice(first, first + rows)
+    rows = max(1, points_at_once // (out.size // shape[0]))
+    for begin in range(0, shape[0], rows):
+        part = slice(begin, begin + rows)
         # An axis of one stands for all rows.
         x, y = (
             a[part] if a.ndim == len(shape) and len(a) > 1 else a for a in (longitude, latitude)
@@ -99,20 +99,20 @@ def _bilinear(
 ) -> Float[np.ndarray, "*shape"]:
     """Values at rows and columns; NaN outside, or if a NaN has a weight."""
     edge = 1e-6  # cells: by rounding of degrees a point of the border may lie beyond it
-    inside = lambda place, n: np.where(
+    clip_inside = lambda place, n: np.where(
         (place >= -edge) & (place <= n - 1 + edge), np.clip(place, 0, n - 1), np.nan
     )
     (i, u), (k, v) = (
         (np.clip(np.nan_to_num(np.floor(p)).astype(int), 0, n - 2), p)
-        for p, n in zip(map(inside, (row, column), values.shape), values.shape)
+        for p, n in zip(map(clip_inside, (row, column), values.shape), values.shape)
     )
     u, v = u - i, v - k
     # A NaN beside a point that lies on a line of the grid has the weight 0, but 0·NaN is NaN.
-    between = lambda w, low, high: (
+    interpolate = lambda w, low, high: (
         np.where(w == 0, 0, w * high) + np.where(w == 1, 0, (1 - w) * low)
     )
-    in_row = lambda i: between(v, values[i, k], values[i, k + 1])
-    return between(u, in_row(i), in_row(i + 1))
+    in_row = lambda i: interpolate(v, values[i, k], values[i, k + 1])
+    return interpolate(u, in_row(i), in_row(i + 1))
 
 
 def _grid_of_proj(name: Path) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

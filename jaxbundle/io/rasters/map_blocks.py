@@ -133,8 +133,8 @@ def write_map(
             min(BLOCK_SIZE, grid.rows - corner[0]),
             min(BLOCK_SIZE, grid.columns - corner[1]),
         )
-        kept = lambda k, corner: checkpoint and checkpoint.take(k, size(corner), bands.dtype)
-        for k, (corner, values, is_new) in enumerate(_in_order(corners, kept, compute)):
+        take_kept = lambda k, corner: checkpoint and checkpoint.take(k, size(corner), bands.dtype)
+        for k, (corner, values, is_new) in enumerate(_in_order(corners, take_kept, compute)):
             if is_new and checkpoint is not None:
                 checkpoint.add(k, values)
             if values is not None and values.size:
@@ -145,21 +145,27 @@ def write_map(
 
 def _in_order(
     corners: Sequence[tuple[int, int]],
-    kept: Callable[[int, tuple[int, int]], np.ndarray | None],
+    take_kept: Callable[[int, tuple[int, int]], np.ndarray | None],
     compute: Callable[[tuple[int, int]], np.ndarray | None],
 ) -> Iterator[tuple[tuple[int, int], np.ndarray | None, bool]]:
     """The values of blocks in their order, kept ones or else computed by workers, and whether they
     were computed."""
-    first = 0
-    while first < len(corners) and (values := kept(first, corners[first])) is not None:
-        yield corners[first], values, False
-        first += 1
-    left = iter(corners[first:])
+    number_kept = 0
+    while (
+        number_kept < len(corners)
+        and (values := take_kept(number_kept, corners[number_kept])) is not None
+    ):
+        yield corners[number_kept], values, False
+        number_kept += 1
+    corners_left = iter(corners[number_kept:])
     waiting: deque[tuple[tuple[int, int], Future]] = deque()
     with ThreadPoolExecutor(WORKERS) as workers:
         try:
             while True:
-                while len(waiting) < WORKERS + AHEAD and (corner := next(left, None)) is not None:
+                while (
+                    len(waiting) < WORKERS + AHEAD
+                    and (corner := next(corners_left, None)) is not None
+                ):
                     waiting.append((corner, workers.submit(compute, corner)))
                 if not waiting:
                     return

@@ -163,11 +163,11 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
 
     **Raises:** `InputError` if a projected system has its edge among the points.
     """
-    seen = np.flatnonzero(np.isfinite(x))
-    if not len(seen):
+    finite_rows = np.flatnonzero(np.isfinite(x))
+    if not len(finite_rows):
         return x
     # The one nearest to the middle of the lattice that has a place.
-    middle = x.ravel()[seen[np.abs(seen - x.size // 2).argmin()]]
+    middle = x.ravel()[finite_rows[np.abs(finite_rows - x.size // 2).argmin()]]
     x = system.unwrap(x, float(middle))
     if system.transformer and system.turn is None:
         steps = [np.abs(np.diff(x, axis=axis)).ravel() for axis in (0, 1)]
@@ -183,16 +183,16 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
     return x
 
 
-def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf) -> MapGrid:
+def grid_around(x: np.ndarray, y: np.ndarray, size: float, max_pixels: float = np.inf) -> MapGrid:
     """The pixels of this size that cover all points, with edges at multiples of it.
 
-    **Raises:** `InputError` for more than `most` pixels, or too many rows or columns for a GeoTIFF.
-    """
+    **Raises:** `InputError` for more than `max_pixels` pixels, or too many rows or columns for a
+    GeoTIFF."""
     left, right = np.floor(np.nanmin(x) / size), np.ceil(np.nanmax(x) / size)
     bottom, top = np.floor(np.nanmin(y) / size), np.ceil(np.nanmax(y) / size)
     columns, rows = right - left, top - bottom
     # GDAL counts rows and columns by 32 bits with a sign
-    if not (max(rows, columns) < np.iinfo(np.int32).max and rows * columns <= most):
+    if not (max(rows, columns) < np.iinfo(np.int32).max and rows * columns <= max_pixels):
         raise InputError(
             f"--spacing {size:g}: the map would have {rows:.3g} × {columns:.3g} pixels; give a "
             "larger one, in the unit of the map, or another --crs"

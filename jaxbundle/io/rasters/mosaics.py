@@ -45,17 +45,17 @@ def as_one_raster(path: str | Path) -> Iterator[Path]:
 def _virtual(tiles: list[Path]) -> str:
     """The XML of the virtual raster."""
     parts, bounds = [], []
-    first, crs, step = tiles[0], None, (0.0, 0.0)
+    first_tile, crs, step = tiles[0], None, (0.0, 0.0)
     for tile in tiles:
         with open_raster(tile) as source:
             check_georeference(tile, source)
             place = source.transform
-            if tile is first:
+            if tile is first_tile:
                 crs, step, origin = source.crs, (place.a, place.e), (place.c, place.f)
-            at = [(o - q) / s for o, q, s in zip((place.c, place.f), origin, step)]
-            _check_alike(tile, first, source, (crs, step), at)
+            row_and_column = [(o - q) / s for o, q, s in zip((place.c, place.f), origin, step)]
+            _check_alike(tile, first_tile, source, (crs, step), row_and_column)
             rows, columns = source.shape
-            left, top = round(at[0]), round(at[1])
+            left, top = round(row_and_column[0]), round(row_and_column[1])
             bounds.append((left, top, left + columns, top + rows))
             nodata = "" if source.nodata is None else f"<NODATA>{source.nodata!r}</NODATA>"
             scale, offset = source.scales[0], source.offsets[0]
@@ -87,22 +87,22 @@ def _virtual(tiles: list[Path]) -> str:
 
 def _check_alike(
     tile: Path,
-    first: Path,
+    first_tile: Path,
     source: "DatasetReader",
-    known: tuple[object, tuple[float, float]],
-    at: list[float],
+    system_and_step: tuple[object, tuple[float, float]],
+    row_and_column: list[float],
 ) -> None:
     """Refuse a tile that is not on the lattice of the first."""
-    crs, step = known
+    crs, step = system_and_step
     place = source.transform
     todo = "; make one raster of the tiles, such as with gdalwarp, and give that"
     if source.crs != crs:
-        raise InputError(f"{tile}: its coordinate system is not that of {first.name}{todo}")
+        raise InputError(f"{tile}: its coordinate system is not that of {first_tile.name}{todo}")
     # A hundredth of a pixel over the length of a tile.
     length = max(source.shape)
     odd = max(abs(a / s - 1) * length for a, s in zip((place.a, place.e), step))
-    if place.b or place.d or odd > 0.01 or max(abs(v - round(v)) for v in at) > 0.01:
+    if place.b or place.d or odd > 0.01 or max(abs(v - round(v)) for v in row_and_column) > 0.01:
         raise InputError(
             f"{tile}: its pixels of {place.a:g} × {abs(place.e):g} are not on the lattice of "
-            f"{first.name}, {step[0]:g} × {abs(step[1]):g}{todo}"
+            f"{first_tile.name}, {step[0]:g} × {abs(step[1]):g}{todo}"
         )

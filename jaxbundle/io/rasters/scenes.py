@@ -41,7 +41,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
         raise InputError(f"{path}: the raster has no coordinate system; add one")
     with naming_file(path):
         system = MapSystem(earth, None if earth is None else crs.to_wkt())
-    back = ~transform
+    inverse = ~transform
     middle = transform.c + transform.a * bands.shape[2] / 2 + transform.b * bands.shape[1] / 2
 
     def place(
@@ -49,8 +49,8 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
     ) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
         x, y = system.from_ground(X)
         x = system.unwrap(x, middle)
-        column = back.a * x + back.b * y + back.c
-        row = back.d * x + back.e * y + back.f
+        column = inverse.a * x + inverse.b * y + inverse.c
+        row = inverse.d * x + inverse.e * y + inverse.f
         return row - 0.5, column - 0.5
 
     return SceneRaster(bands, dtype, place)
@@ -74,17 +74,17 @@ def write_taken(
 
     **Raises:** `InputError` if the scene is not in the image.
     """
-    seen = False
+    has_pixels = False
     with write_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
-        for first in range(0, image.lines, portion):
-            lines = np.arange(first, first + portion, dtype=float)
+        for begin in range(0, image.lines, portion):
+            lines = np.arange(begin, begin + portion, dtype=float)
             # The last portion is as long as the others, so that it needs no program of its own.
-            inside = np.minimum(lines, image.lines - 1)
-            values = take_image(image, surface, bands, place, inside, resampling)
-            values = values[:, : image.lines - first]
-            seen |= bool(np.isfinite(values).any())
-            target.write(as_type(values, dtype), first)
+            lines_inside = np.minimum(lines, image.lines - 1)
+            values = take_image(image, surface, bands, place, lines_inside, resampling)
+            values = values[:, : image.lines - begin]
+            has_pixels |= bool(np.isfinite(values).any())
+            target.write(as_type(values, dtype), begin)
             if progress:
-                progress("lines", first + values.shape[1], image.lines)
-        if not seen:
+                progress("lines", begin + values.shape[1], image.lines)
+        if not has_pixels:
             raise InputError("the image shows nothing of the scene: check track and coordinates")

@@ -85,8 +85,8 @@ def _degrees_around(path: str | Path, source: "DatasetReader") -> str:
 
     left, bottom, right, top = source.bounds
     with foreign_parser(path, KNOWN_SYSTEM):
-        back = pyproj.Transformer.from_crs(source.crs.to_wkt(), GEOGRAPHIC, always_xy=True)
-        middle, _ = back.transform((left + right) / 2, (bottom + top) / 2)
+        to_geographic = pyproj.Transformer.from_crs(source.crs.to_wkt(), GEOGRAPHIC, always_xy=True)
+        middle, _ = to_geographic.transform((left + right) / 2, (bottom + top) / 2)
     return (
         f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.0f}"
         if np.isfinite(middle)
@@ -108,19 +108,22 @@ def _terrain(
     if transform.b or transform.d:
         raise InputError(f"{path}: the raster is rotated; make it north up with gdalwarp")
     step = transform.a, transform.e
-    read = lambda source: (
+    read_cells = lambda source: (
         (_heights(path, source, None, height), (0, 0))
         if earth is None or extent is None
-        else _cut(source, path, extent, height)
+        else _cut_extent(source, path, extent, height)
     )
-    heights, first = read(source)
+    heights, first_cell = read_cells(source)
     if _has_strange_heights(heights):
-        _refuse_undeclared_no_data(path, heights if exact is None else read(exact)[0], height)
+        _refuse_undeclared_no_data(path, heights if exact is None else read_cells(exact)[0], height)
     unit = 1.0 if earth is None else np.pi / 180
-    x, y = transform.c + (first[1] + 0.5) * step[0], transform.f + (first[0] + 0.5) * step[1]
+    x, y = (
+        transform.c + (first_cell[1] + 0.5) * step[0],
+        transform.f + (first_cell[0] + 0.5) * step[1],
+    )
     if not np.isfinite(heights).any():
-        there = "" if extent is None else f" where the image looks, {extent}"
-        raise InputError(f"{path}: no height{there}; give a model that covers the image")
+        place_in_words = "" if extent is None else f" where the image looks, {extent}"
+        raise InputError(f"{path}: no height{place_in_words}; give a model that covers the image")
     with naming_file(path):
         return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
 
@@ -144,22 +147,24 @@ def _refuse_undeclared_no_data(
     **Arguments:** `gap`: metres to the next height. Deep sea and high mountains of other bodies
     have heights between.
     """
-    known = heights[np.isfinite(heights)]
-    for end, sign in ((known.min(), 1.0), (known.max(), -1.0)):
-        others = known[known != end]
-        if not len(others):
+    known_heights = heights[np.isfinite(heights)]
+    for end, sign in ((known_heights.min(), 1.0), (known_heights.max(), -1.0)):
+        other_heights = known_heights[known_heights != end]
+        if not len(other_heights):
             return
-        nearest = others.min() if sign > 0 else others.max()
+        nearest = other_heights.min() if sign > 0 else other_heights.max()
         if sign * (nearest - end) > gap and _has_strange_heights(end[None, None]):
             mark = (end - height.offset) / height.scale
             raise InputError(
-                f"{path}: {len(known) - len(others)} of {len(known)} cells have the height "
-                f"{end:.10g}, the others {others.min():.6g} to {others.max():.6g}; if it "
+                f"{path}: {len(known_heights) - len(other_heights)} of {len(known_heights)} cells "
+                "have the height "
+                f"{end:.10g}, the others {other_heights.min():.6g} to {other_heights.max():.6g}; "
+                "if it "
                 f"marks cells without height, declare it: gdal_edit.py -a_nodata {mark:.10g} FILE"
             )
 
 
-def _cut(
+def _cut_extent(
     source: "DatasetReader", path: str | Path, extent: Extent, height: HeightScale
 ) -> tuple[Float[np.ndarray, "rows columns"], tuple[int, int]]:
     """The heights of the extent and a cell around it, and the row and column of the first."""

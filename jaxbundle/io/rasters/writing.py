@@ -93,27 +93,29 @@ def write_raster(
             finally:
                 with _silence:
                     raster.close()
-            whole = _is_whole(name, writer.sums)
-            if whole and finish is not None:
+            is_whole = _is_whole(name, writer.sums)
+            if is_whole and finish is not None:
                 with _silence:
                     finish(name)
-                whole = _is_whole(name, writer.sums)
+                is_whole = _is_whole(name, writer.sums)
         except package.errors.RasterioError as error:
             why = error.__cause__ or error
             raise _unwritable(target, " ".join(str(why).split()).rstrip(".")) from None
-        if not whole:
+        if not is_whole:
             raise _unwritable(target, "the written data are not on the disk")
 
 
-def add_overviews(path: Path, size: tuple[int, int], nearest: bool, least: int = 256) -> None:
+def add_overviews(
+    path: Path, size: tuple[int, int], nearest: bool, smallest_side: int = 256
+) -> None:
     """Add overviews to a GeoTIFF: half the size, a quarter and so on, each pixel the mean of those
     with data that it covers, or one of them (`nearest`).
 
-    **Arguments:** `least`: rows and columns down to which the overviews go, those of a tile.
-    """
+    **Arguments:** `smallest_side`: rows and columns down to which the overviews go, those of a
+    tile."""
     package = rasterio()
     factors = []
-    while max(size) > least * 2 ** len(factors):
+    while max(size) > smallest_side * 2 ** len(factors):
         factors.append(2 ** (len(factors) + 1))
     if not factors:
         return
@@ -126,12 +128,12 @@ def make_cog(path: Path, compress: str, block: int, nearest: bool) -> None:
     """Replace a GeoTIFF with its overviews by a Cloud Optimized GeoTIFF of the same values."""
     import rasterio.shutil
 
-    other = path.with_name(f"{path.stem}.cog{path.suffix}")
-    with temporary(other):
+    temporary_file = path.with_name(f"{path.stem}.cog{path.suffix}")
+    with temporary(temporary_file):
         options = {"compress": compress, "predictor": "yes"} if compress != "none" else {}
         rasterio.shutil.copy(
             path,
-            other,
+            temporary_file,
             driver="COG",
             BLOCKSIZE=block,
             OVERVIEWS="AUTO",
@@ -139,7 +141,7 @@ def make_cog(path: Path, compress: str, block: int, nearest: bool) -> None:
             BIGTIFF="IF_SAFER",
             **options,
         )
-        os.replace(other, path)
+        os.replace(temporary_file, path)
 
 
 def _is_whole(path: Path, sums: Mapping[tuple, int]) -> bool:

@@ -43,11 +43,11 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
         drawing.layers.add(layer, color=COLOURS["camera" if layer[0] == "C" else "tie"])
     space = drawing.modelspace()
     points = network.points
-    known = np.isfinite(points.position).all(1)
+    is_known = np.isfinite(points.position).all(1)
     corners, _ = pyramids(network)
-    everything = np.concatenate([points.position[known], corners.reshape(-1, 3)])
+    everything = np.concatenate([points.position[is_known], corners.reshape(-1, 3)])
     height = 0.01 * float(np.ptp(everything, axis=0).max())  # of names, legible on a full page
-    for row in np.flatnonzero(known):
+    for row in np.flatnonzero(is_known):
         place = tuple(points.position[row].tolist())
         space.add_point(place, dxfattribs={"layer": f"POINTS_{points.role[row].upper()}"})
         _write_name(space, points.id[row], place, height, "POINT_NAMES")

@@ -65,17 +65,17 @@ def write_geojson(
     """
     transform = require_transformation(crs)
     features = []
-    for one in collect_features(result, factor):
-        place = np.atleast_2d(one.place)
+    for feature in collect_features(result, factor):
+        place = np.atleast_2d(feature.place)
         lonlat = np.column_stack(transform(place[:, 0], place[:, 1]))
         if not np.isfinite(lonlat).all() or not (np.abs(lonlat) <= [180.0, 90.0]).all():
             raise InputError(f"{crs}: the coordinates are outside of this system")
         features.append(
             {
                 "type": "Feature",
-                "id": f"{one.layer}/{one.attributes['id']}",
-                "geometry": _geometry(lonlat, place, one.layer),
-                "properties": {"layer": one.layer, **_plain(one.attributes)},
+                "id": f"{feature.layer}/{feature.attributes['id']}",
+                "geometry": _geometry(lonlat, place, feature.layer),
+                "properties": {"layer": feature.layer, **_plain(feature.attributes)},
             }
         )
     document = {"type": "FeatureCollection", "features": features}
@@ -127,10 +127,10 @@ def check_crs(crs: str) -> int | None:
     **Raises:** `InputError` for other texts."""
     if not crs:
         return None
-    found = re.fullmatch(r"(?i)epsg:(\d{4,6})", crs.strip())
-    if found is None:
+    match = re.fullmatch(r"(?i)epsg:(\d{4,6})", crs.strip())
+    if match is None:
         raise InputError(f"crs {crs!r}: expected EPSG:NUMBER, such as EPSG:25832")
-    return int(found[1])
+    return int(match[1])
 
 
 def require_transformation(crs: str) -> Any:
@@ -163,8 +163,8 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
         size = lambda C: np.trace(C, axis1=1, axis2=2)[:, None, None]
         C = np.where(size(modelled) > size(C), modelled, C)
     place = result.point_values
-    known = np.asarray(np.isfinite(place).all(1))
-    for row in np.flatnonzero(known):
+    is_known = np.asarray(np.isfinite(place).all(1))
+    for row in np.flatnonzero(is_known):
         sigma = np.sqrt(np.clip(np.diagonal(C[row]), 0, None))
         yield Feature(
             "points",
@@ -190,23 +190,23 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
             },
         )
     ids = [str(id) for id in points["id"]]
-    yield from _ellipses(place, C, known, ids, factor)
+    yield from _ellipses(place, C, is_known, ids, factor)
 
 
 def _ellipses(
     place: Float[np.ndarray, "n 3"],
     C: Float[np.ndarray, "n 3 3"],
-    known: np.ndarray,
+    is_known: np.ndarray,
     ids: Sequence[str],
     factor: float | None,
 ) -> Iterator[Feature]:
-    rows = [r for r in np.flatnonzero(known) if np.isfinite(C[r]).all() and C[r, 0, 0] > 0]
+    rows = [r for r in np.flatnonzero(is_known) if np.isfinite(C[r]).all() and C[r, 0, 0] > 0]
     if not rows:
         return
     w, E = np.linalg.eigh(C[rows][:, :2, :2])
     axes = np.sqrt(np.clip(w, 0, None))
     if factor is None:
-        extent = float(np.ptp(place[known][:, :2], axis=0).max()) or 1.0
+        extent = float(np.ptp(place[is_known][:, :2], axis=0).max()) or 1.0
         factor = round_down(0.02 * extent / float(axes.max()))
     factor = positive("factor", factor)
     turn = 2 * np.pi * np.arange(CORNERS) / CORNERS
@@ -290,9 +290,9 @@ def _fill(database: sqlite3.Connection, features: list[Feature], system: int | N
         name, definition = _definition(system)
         database.execute(add, (name, system, "EPSG", system, definition, name))
     for layer in LAYERS:
-        own = [one for one in features if one.layer == layer]
-        if own:
-            _add_layer(database, layer, own, srs)
+        features_of_layer = [feature for feature in features if feature.layer == layer]
+        if features_of_layer:
+            _add_layer(database, layer, features_of_layer, srs)
 
 
 def _definition(system: int) -> tuple[str, str]:
@@ -303,8 +303,8 @@ def _definition(system: int) -> tuple[str, str]:
     except ImportError:
         return f"EPSG:{system}", "undefined"
     try:
-        found = pyproj.CRS.from_epsg(system)
-        return found.name, found.to_wkt("WKT1_GDAL")
+        system_found = pyproj.CRS.from_epsg(system)
+        return system_found.name, system_found.to_wkt("WKT1_GDAL")
     except CRSError as error:
         raise InputError(f"crs EPSG:{system}: {' '.join(str(error).split())}") from None
 
@@ -321,7 +321,7 @@ def _add_layer(database: sqlite3.Connection, layer: str, features: list[Feature]
         f'CREATE TABLE "{layer}" (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind}, '
         f"{columns})"
     )
-    corners = np.concatenate([np.atleast_2d(one.place)[:, :2] for one in features])
+    corners = np.concatenate([np.atleast_2d(feature.place)[:, :2] for feature in features])
     low, high = corners.min(0).tolist(), corners.max(0).tolist()
     database.execute(
         "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, max_x, max_y, "
@@ -335,15 +335,15 @@ def _add_layer(database: sqlite3.Connection, layer: str, features: list[Feature]
     listed = ", ".join(f'"{name}"' for name in names)
     database.executemany(
         f'INSERT INTO "{layer}" (geom, {listed}) VALUES ({marks})',
-        [(_blob(one, srs), *_plain(one.attributes).values()) for one in features],
+        [(_blob(feature, srs), *_plain(feature.attributes).values()) for feature in features],
     )
 
 
-def _blob(one: Feature, srs: int) -> bytes:
+def _blob(feature: Feature, srs: int) -> bytes:
     """A geometry: the header of a GeoPackage (little-endian, no envelope), and ISO WKB."""
     header = b"GP" + struct.pack("<BBi", 0, 1, srs)
-    if one.layer != "ellipses":
-        return header + struct.pack("<BI3d", 1, 1001, *one.place.tolist())
-    ring = one.place if _is_counterclockwise(one.place) else one.place[::-1]
+    if feature.layer != "ellipses":
+        return header + struct.pack("<BI3d", 1, 1001, *feature.place.tolist())
+    ring = feature.place if _is_counterclockwise(feature.place) else feature.place[::-1]
     ring = np.concatenate([ring, ring[:1]])
     return header + struct.pack("<BIII", 1, 3, 1, len(ring)) + ring.astype("<f8").tobytes()

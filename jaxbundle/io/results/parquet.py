@@ -35,6 +35,6 @@ def write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
         )
         for name, values in columns.items()
     }
-    written = io.BytesIO()
-    parquet.write_table(arrow.table(arrays), written)
-    write_bytes(path, written.getvalue())
+    buffer = io.BytesIO()
+    parquet.write_table(arrow.table(arrays), buffer)
+    write_bytes(path, buffer.getvalue())

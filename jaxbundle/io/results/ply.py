@@ -38,23 +38,30 @@ def write_ply(
     **Returns:** messages about what is lost.
     """
     need_values(network, points=False)
-    known = np.all(np.isfinite(network.points.position), axis=1)
+    is_known = np.all(np.isfinite(network.points.position), axis=1)
     corners, edges = pyramids(network)
-    vertices = np.zeros(known.sum() + 5 * len(corners), VERTEX)
-    first = int(known.sum())
-    vertices["position"][:first] = network.points.position[known]
+    vertices = np.zeros(is_known.sum() + 5 * len(corners), VERTEX)
+    number_of_points = int(is_known.sum())
+    vertices["position"][:number_of_points] = network.points.position[is_known]
     errors, unit = point_errors(network)
-    vertices["error"][:first], vertices["error"][first:] = errors[known], np.nan
-    vertices["position"][first:] = corners.reshape(-1, 3)
+    vertices["error"][:number_of_points], vertices["error"][number_of_points:] = (
+        errors[is_known],
+        np.nan,
+    )
+    vertices["position"][number_of_points:] = corners.reshape(-1, 3)
     rgb = network.points.colour
     if rgb is None:
         rgb = np.array([COLOURS[role] for role in network.points.role], np.uint8).reshape(-1, 3)
     if colours:
-        own = [colours.get(id, given) for id, given in zip(network.points.id, rgb.tolist())]
-        rgb = np.array(own, np.uint8)
-    vertices["colour"][:first] = rgb[known]
-    vertices["colour"][first:] = (220, 40, 40)  # red: cameras, against the blues of points
-    edges = (edges.reshape(-1, 2) + first).astype("<i4")
+        own_colours = [colours.get(id, given) for id, given in zip(network.points.id, rgb.tolist())]
+        rgb = np.array(own_colours, np.uint8)
+    vertices["colour"][:number_of_points] = rgb[is_known]
+    vertices["colour"][number_of_points:] = (
+        220,
+        40,
+        40,
+    )  # red: cameras, against the blues of points
+    edges = (edges.reshape(-1, 2) + number_of_points).astype("<i4")
     head = [
         "ply",
         "format binary_little_endian 1.0",

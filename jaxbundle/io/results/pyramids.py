@@ -27,9 +27,9 @@ def pyramids(
     if len(points) and np.isfinite(points.position).all(1).any():
         middle = np.nanmean(points.position, axis=0)
         distance = float(np.median(np.linalg.norm(centre - middle, axis=1)))
-    half = np.array([_half(camera) for camera in network.cameras])[images.camera]
+    half_sizes = np.array([_half_size(camera) for camera in network.cameras])[images.camera]
     rays = np.concatenate(
-        [CORNERS[None] * half[:, None], np.full((len(images), 4, 1), -1.0)], axis=2
+        [CORNERS[None] * half_sizes[:, None], np.full((len(images), 4, 1), -1.0)], axis=2
     )
     M = matrices_of(images.angles)
     corners = centre[:, None] + length * distance * rays @ M
@@ -38,7 +38,7 @@ def pyramids(
     return vertices, edges[None] + 5 * np.arange(len(images))[:, None, None]
 
 
-def _half(camera: Camera) -> tuple[float, float]:
+def _half_size(camera: Camera) -> tuple[float, float]:
     """Half width and half height of the image for the principal distance 1."""
     model, p = get_model(camera.model), all_parameters(camera)
     size = None if camera.image_size is None else np.array(camera.image_size, float)

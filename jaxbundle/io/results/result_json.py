@@ -110,19 +110,19 @@ def unsolved_text(error: NotSolvedError) -> str:
 
 
 def result_text(
-    adjustment: "Adjustment", brief: bool = False, also: Mapping = MappingProxyType({})
+    adjustment: "Adjustment", brief: bool = False, further_entries: Mapping = MappingProxyType({})
 ) -> Iterator[str]:
     """The result as JSON text, one line that ends with a line feed, in pieces: 2 000 000
-    image points take 1 GB. `also`: further entries."""
+    image points take 1 GB. `further_entries`: further entries."""
     # Without the long tables, which would need their memory at once.
-    head = result_dict(adjustment, brief=True) | dict(also)
+    head = result_dict(adjustment, brief=True) | dict(further_entries)
     if brief or not adjustment.converged:
         yield _text(head) + "\n"
         return
-    more = {"verdict": verdict_dict(adjustment.verdict)}
-    more |= {"variance_components": _components(adjustment)}
+    further = {"verdict": verdict_dict(adjustment.verdict)}
+    further |= {"variance_components": _components(adjustment)}
     # The two long tables are written in portions between the braces of the rest.
-    yield _text({**more, **head})[:-1]
+    yield _text({**further, **head})[:-1]
     yield ', "points": {'
     yield from _join(_text(dict(some))[1:-1] for some in take_portions(_points(adjustment.points)))
     yield '}, "residuals": ['
@@ -165,15 +165,15 @@ def verdict_dict(verdict: "Verdict") -> dict:
     }
 
 
-def _camera(table: dict, given: "Camera") -> dict:
+def _camera(table: dict, camera: "Camera") -> dict:
     free = table["free"]
     by_name = lambda C: {
         a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
     }
     return {
         "model": table["model"],
-        "image_size": given.image_size and list(given.image_size),
-        "pixel_size": given.pixel_size and list(given.pixel_size),
+        "image_size": camera.image_size and list(camera.image_size),
+        "pixel_size": camera.pixel_size and list(camera.pixel_size),
         "parameters": table["parameters"],
         **{name: by_name(table[name]) for name in CORRELATIONS if name in table},
     }
@@ -228,30 +228,30 @@ def _points(table: Mapping[str, np.ndarray]) -> Iterator[tuple[str, dict]]:
         )
 
 
-def _second_minimum(adjustment: "Adjustment", one: "SecondMinimum") -> dict:
+def _second_minimum(adjustment: "Adjustment", second_minimum: "SecondMinimum") -> dict:
     return {
-        "ambiguity": one.ambiguity,
-        "images": list(one.images),
-        "vtpv": one.vtpv,
-        "other_vtpv": one.other_vtpv,
-        "difference": one.difference,
-        "evidence": one.evidence,
-        "probability": one.probability,
-        "ambiguous": one.ambiguous,
-        "taken": one.taken,
-        "turn": one.turn * adjustment.angle_scale,
-        "shift": one.shift,
+        "ambiguity": second_minimum.ambiguity,
+        "images": list(second_minimum.images),
+        "vtpv": second_minimum.vtpv,
+        "other_vtpv": second_minimum.other_vtpv,
+        "difference": second_minimum.difference,
+        "evidence": second_minimum.evidence,
+        "probability": second_minimum.probability,
+        "ambiguous": second_minimum.ambiguous,
+        "taken": second_minimum.taken,
+        "turn": second_minimum.turn * adjustment.angle_scale,
+        "shift": second_minimum.shift,
     }
 
 
 def _far_points(adjustment: "Adjustment") -> dict:
-    far = adjustment.far_points
-    if far is None:
+    points = adjustment.far_points
+    if points is None:
         return {}
     columns = {name: column.tolist() for name, column in adjustment.table("far_points").items()}
-    inverse = zip(far.inverse_distance.tolist(), far.sigma_inverse_distance.tolist())
+    inverse = zip(points.inverse_distance.tolist(), points.sigma_inverse_distance.tolist())
     return {
-        "origin": dict(zip("XYZ", far.origin.tolist())),
+        "origin": dict(zip("XYZ", points.origin.tolist())),
         "points": {
             point: {
                 "direction": {axis: columns[f"u{axis}"][i] for axis in "XYZ"},

@@ -40,17 +40,17 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
     network = problem.network
     values = adjustment.image_values
     images, points, rays = network.images, network.points, network.observations
-    gone = {(name.id, name.parameter) for name in adjustment.eliminated}
+    eliminated = {(name.id, name.parameter) for name in adjustment.eliminated}
     cameras = tuple(
         dataclasses.replace(
             with_start(camera, adjustment.camera_parameters(camera.id))
             if get_model(camera.model).prior
             else _unobserved(camera, adjustment),
-            free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
+            free=tuple(name for name in camera.unknowns if (camera.id, name) not in eliminated),
         )
         for camera in network.cameras
     )
-    used = problem.used
+    is_used = problem.used
     roles = tuple("tie" if role == "control" else role for role in points.role)
     adjusted = network.replace(
         cameras=cameras,
@@ -68,7 +68,7 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
             position=adjustment.point_values,
             sigma=np.full_like(points.sigma, np.nan),
         ),
-        observations=rays.take(used),
+        observations=rays.take(is_used),
         datum="inner",
         datum_points=(),
         further=_interfaces_at_solution(adjustment),
@@ -92,15 +92,18 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     problem = adjustment.problem
     network = problem.network
     images, rays = network.images, network.observations
-    values, gone = adjustment.image_values, {(n.id, n.parameter) for n in adjustment.eliminated}
+    values, eliminated = (
+        adjustment.image_values,
+        {(n.id, n.parameter) for n in adjustment.eliminated},
+    )
     cameras = tuple(
         dataclasses.replace(
             _unobserved(camera, adjustment),
-            free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
+            free=tuple(name for name in camera.unknowns if (camera.id, name) not in eliminated),
         )
         for camera in network.cameras
     )
-    weight, used = problem.image_weights, problem.used
+    weight, is_used = problem.image_weights, problem.used
     distance_weight = _weights(problem, "distance", (len(network.distances), 1)).ravel()
     adjusted = network.replace(
         cameras=cameras,
@@ -117,9 +120,9 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
             rays,
             sigma=_sigma(weight, np.nan),
             sigma_origin=ESTIMATED if adjustment.sigma_factors else rays.sigma_origin,
-        ).take(used),
+        ).take(is_used),
         distances=dataclasses.replace(network.distances, sigma=_sigma(distance_weight, np.nan)),
-        further=_join_tables(*_further(adjustment), *_priors(adjustment)),
+        further=_join_tables(*_other_kinds(adjustment), *_priors(adjustment)),
         warnings=(),
         notes=("the adjusted network",),
     )
@@ -129,12 +132,12 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
 
 def _interfaces_at_solution(adjustment: "Adjustment") -> tuple[ObservationTable, ...]:
     """The interfaces of a network as they were estimated: without them rays would be straight."""
-    found = adjustment.further_unknowns
+    estimates = adjustment.further_unknowns
     radians = 1 / adjustment.angle_scale
     return tuple(
-        one.at(found, radians)
-        for one in adjustment.problem.network.further
-        if isinstance(one, Interfaces)
+        kind.at(estimates, radians)
+        for kind in adjustment.problem.network.further
+        if isinstance(kind, Interfaces)
     )
 
 
@@ -148,8 +151,8 @@ def _weights(
     problem: "NetworkProblem", name: str, otherwise: tuple[int, int]
 ) -> Float[np.ndarray, "rows residuals"]:
     """1/σ of a set of observations; of one that the network lacks, zeros of the shape given."""
-    known = any(o.name == name for o in problem.observations)
-    return problem.weights(name) if known else np.zeros(otherwise)
+    is_known = any(o.name == name for o in problem.observations)
+    return problem.weights(name) if is_known else np.zeros(otherwise)
 
 
 def _sigma(weight: Float[np.ndarray, "..."], otherwise: float) -> Float[np.ndarray, "..."]:
@@ -164,10 +167,12 @@ def _given_points(adjustment: "Adjustment") -> Points:
     points = problem.network.points
     control = np.flatnonzero(points.has_role("control"))
     weight = _weights(problem, "control", (0, 3))
-    given = np.asarray(problem.data.measured.get("control", np.zeros((0, 3)))) + problem.origin
+    given_coordinates = (
+        np.asarray(problem.data.measured.get("control", np.zeros((0, 3)))) + problem.origin
+    )
     position, sigma = adjustment.point_values.copy(), np.full_like(points.sigma, np.nan)
     sigma[control] = _sigma(weight, np.inf)
-    position[control] = np.where(weight > 0, given, position[control])
+    position[control] = np.where(weight > 0, given_coordinates, position[control])
     roles = np.array(points.role, dtype=object)
     roles[control[~(weight > 0).any(1)]] = "tie"
     # A tie point has no observed coordinates.
@@ -179,24 +184,24 @@ def _priors(adjustment: "Adjustment") -> list[ObservationTable]:
     """What was observed of orientations and cameras."""
     problem = adjustment.problem
     network, measured = problem.network, problem.data.measured
-    known = {o.name: o for o in problem.observations}
+    sets = {o.name: o for o in problem.observations}
     tables: list[ObservationTable] = []
-    if "exterior" in known:
+    if "exterior" in sets:
         value = np.asarray(measured["exterior"]) + np.concatenate([problem.origin, np.zeros(3)])
-        image = tuple(network.images.id[k] for k in known["exterior"].rows[0])
+        image = tuple(network.images.id[k] for k in sets["exterior"].rows[0])
         sigma = _sigma(problem.weights("exterior"), np.inf)
         tables.append(ExteriorPriors(image=image, value=value, sigma=sigma))
-    gone = {(name.id, name.parameter) for name in adjustment.eliminated}
+    eliminated = {(name.id, name.parameter) for name in adjustment.eliminated}
     rows = []
     for table in problem.cameras:
-        if table.interior_set not in known:
+        if table.interior_set not in sets:
             continue
         weights = problem.weights(table.interior_set)
-        for row, of_table in enumerate(known[table.interior_set].rows[0]):
+        for row, of_table in enumerate(sets[table.interior_set].rows[0]):
             camera = network.cameras[table.cameras[of_table]]
             for j, name in enumerate(table.parameters):
-                used = weights[row, j] > 0 and name in camera.unknowns
-                if used and (camera.id, name) not in gone:
+                has_prior = weights[row, j] > 0 and name in camera.unknowns
+                if has_prior and (camera.id, name) not in eliminated:
                     value = float(measured[table.interior_set][row, j])
                     rows.append((camera.id, name, value, float(1 / weights[row, j])))
     if rows:
@@ -209,22 +214,22 @@ def _priors(adjustment: "Adjustment") -> list[ObservationTable]:
     return tables
 
 
-def _join_tables(*further: ObservationTable) -> tuple[ObservationTable, ...]:
+def _join_tables(*tables_to_join: ObservationTable) -> tuple[ObservationTable, ...]:
     """One table of each kind: priors follow the rows of the same kind that the network had."""
     tables: dict[str, ObservationTable] = {}
-    for table in further:
-        first = tables.get(table.TABLE)
-        if first is None:
+    for table in tables_to_join:
+        earlier = tables.get(table.TABLE)
+        if earlier is None:
             tables[table.TABLE] = table
             continue
         names = [f.name for f in dataclasses.fields(table) if f.name not in ("settings", "source")]
         join = lambda a, b: np.concatenate([a, b]) if isinstance(a, np.ndarray) else (*a, *b)
-        both: dict = {name: join(getattr(first, name), getattr(table, name)) for name in names}
-        tables[table.TABLE] = type(table)(**both, settings=first.settings)
+        joined: dict = {name: join(getattr(earlier, name), getattr(table, name)) for name in names}
+        tables[table.TABLE] = type(table)(**joined, settings=earlier.settings)
     return tuple(tables.values())
 
 
-def _further(adjustment: "Adjustment") -> list[ObservationTable]:
+def _other_kinds(adjustment: "Adjustment") -> list[ObservationTable]:
     """The observations of further kinds without those removed by data snooping, with their final σ:
     a kind with one observation per row of its table is followed row by row."""
     problem = adjustment.problem
@@ -232,22 +237,24 @@ def _further(adjustment: "Adjustment") -> list[ObservationTable]:
     # The engine's sets in the order of declaration, the user's own before those of the network.
     kinds = sorted(present_kinds(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
     numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
-    own = len(problem.further_sets) - sum(numbers)
-    names, tables = iter(problem.further_sets[own:]), []
+    number_own = len(problem.further_sets) - sum(numbers)
+    names, tables = iter(problem.further_sets[number_own:]), []
     for table, number in zip(kinds, numbers):
         if not number:
             tables.append(table)
             continue
-        first, *_ = [problem.observations_of(next(names)) for _ in range(number)]
-        factor = adjustment.sigma_factors.get(first.kind.name, 1.0)
+        first_set, *_ = [problem.observations_of(next(names)) for _ in range(number)]
+        factor = adjustment.sigma_factors.get(first_set.kind.name, 1.0)
         if isinstance(table, RobotPoses) and number > 1:
             table, factor = table.rescale(adjustment.sigma_factors), 1.0
         for name, power in (("sigma", 1), ("covariance", 2)):
             if factor != 1 and hasattr(table, name):
                 changed: dict = {name: getattr(table, name) * factor**power}
                 table = dataclasses.replace(table, **changed)
-        if first.number == len(table):
-            whole = np.abs(np.asarray(problem.weights(first.name))).reshape(len(table), -1).max(1)
-            table = table.take(whole > 0)
+        if first_set.number == len(table):
+            largest_weight = (
+                np.abs(np.asarray(problem.weights(first_set.name))).reshape(len(table), -1).max(1)
+            )
+            table = table.take(largest_weight > 0)
         tables += [table] if len(table) else []
     return tables

@@ -33,17 +33,19 @@ def write_tree(path: str | Path, tree: Any, classes: Sequence[type]) -> None:
         np.savez_compressed(file, **content)
 
 
-def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
-    """Read a tree of `write_tree`; `what` names the expected content in messages.
+def read_tree(path: str | Path, classes: Sequence[type], content: str) -> Any:
+    """Read a tree of `write_tree`; `content` names the expected content in messages.
 
     **Raises:** `InputError` for a missing file, or other content."""
-    arrays = read_arrays(path, what)
-    damaged = InputError(f"{path}: is not {what}, or is damaged")
+    arrays = read_arrays(path, content)
+    damaged = InputError(f"{path}: is not {content}, or is damaged")
     if HEAD not in arrays:
         raise damaged
     document = parse_json(path, arrays.pop(HEAD).tobytes().decode(errors="replace"))
     try:
-        return _restore(document, arrays, {one.__name__: one for one in classes})
+        return _restore(
+            document, arrays, {known_class.__name__: known_class for known_class in classes}
+        )
     except (ValueError, TypeError, LookupError, AttributeError):
         # Classes refuse what does not fit their fields by errors of their own.
         raise damaged from None
@@ -52,10 +54,10 @@ def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
 def fingerprint(tree: Any, classes: Sequence[type], without: Sequence[type] = ()) -> str:
     """16 hex digits of a tree; objects in `without` are ignored."""
     head, arrays = flatten(tree, classes, without)
-    found = hashlib.blake2b(head, digest_size=8)
+    digest = hashlib.blake2b(head, digest_size=8)
     for array in arrays.values():
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def flatten(
@@ -63,7 +65,7 @@ def flatten(
 ) -> tuple[bytes, dict[str, np.ndarray]]:
     """JSON text, and the arrays it refers to by name."""
     arrays: dict[str, np.ndarray] = {}
-    names = {one: one.__name__ for one in classes}
+    names = {known_class: known_class.__name__ for known_class in classes}
 
     def plain(value: Any) -> Any:
         if value is None or isinstance(value, bool | int | float | str):
@@ -78,11 +80,11 @@ def flatten(
                 arrays[f"array{len(arrays)}"] = array
                 return {"array": f"array{len(arrays) - 1}"}
         if isinstance(value, tuple):
-            return {"tuple": [plain(one) for one in value]}
+            return {"tuple": [plain(known_class) for known_class in value]}
         if isinstance(value, list):
-            return [plain(one) for one in value]
+            return [plain(known_class) for known_class in value]
         if isinstance(value, Mapping):
-            return {"map": [[plain(key), plain(one)] for key, one in value.items()]}
+            return {"map": [[plain(key), plain(known_class)] for key, known_class in value.items()]}
         if type(value) in names:
             kind: Any = type(value)
             fields = [f.name for f in dataclasses.fields(kind)]
@@ -93,16 +95,16 @@ def flatten(
 
 
 def _restore(value: Any, arrays: Mapping[str, np.ndarray], classes: Mapping[str, type]) -> Any:
-    again = lambda one: _restore(one, arrays, classes)
+    restore = lambda part: _restore(part, arrays, classes)
     if isinstance(value, list):
-        return [again(one) for one in value]
+        return [restore(part) for part in value]
     if not isinstance(value, dict):
         return value
     ((kind, content),) = value.items()
     if kind == "array":
         return arrays[content]
     if kind == "tuple":
-        return tuple(again(one) for one in content)
+        return tuple(restore(part) for part in content)
     if kind == "map":
-        return {again(key): again(one) for key, one in content}
-    return classes[kind](**{name: again(one) for name, one in content.items()})
+        return {restore(key): restore(part) for key, part in content}
+    return classes[kind](**{name: restore(part) for name, part in content.items()})

@@ -69,8 +69,8 @@ def read_gcp(path: str | Path) -> ControlFile:
         if not words:
             continue
         where = f"{path}, line {number}"
-        rest = len(words) - FIELDS_OF_POINT
-        if rest < 0 or rest % FIELDS_OF_IMAGE:
+        number_left = len(words) - FIELDS_OF_POINT
+        if number_left < 0 or number_left % FIELDS_OF_IMAGE:
             raise InputError(
                 f"{where}: {len(words)} fields; expected id, latitude, longitude, height, three σ, "
                 "and for every image its name, column, row and two σ"
@@ -109,19 +109,19 @@ def read_match(path: str | Path) -> tuple[Float[np.ndarray, "n 2"], Float[np.nda
     wrong = InputError(f"{path}: is cut, or no binary match file of Ames Stereo Pipeline")
     if len(content) < 16:
         raise wrong
-    first, second = np.frombuffer(content, "<u8", 2).tolist()
-    if first != second or 16 + 2 * first * RECORD.itemsize > len(content):
+    number_first, number_second = np.frombuffer(content, "<u8", 2).tolist()
+    if number_first != number_second or 16 + 2 * number_first * RECORD.itemsize > len(content):
         raise wrong
-    found, at = np.empty((2 * first, 2)), 16
-    for k in range(2 * first):
-        if at + RECORD.itemsize > len(content):
+    places, offset = np.empty((2 * number_first, 2)), 16
+    for k in range(2 * number_first):
+        if offset + RECORD.itemsize > len(content):
             raise wrong
-        record = np.frombuffer(content, RECORD, 1, at)[0]
-        found[k] = record["xy"][::-1]
-        at += RECORD.itemsize + 4 * int(record["length"])
-    if at != len(content):
+        record = np.frombuffer(content, RECORD, 1, offset)[0]
+        places[k] = record["xy"][::-1]
+        offset += RECORD.itemsize + 4 * int(record["length"])
+    if offset != len(content):
         raise wrong
-    return found[:first], found[first:]
+    return places[:number_first], places[number_first:]
 
 
 def images_of_match(path: Path, names: Sequence[str]) -> tuple[str, str]:
@@ -130,11 +130,11 @@ def images_of_match(path: Path, names: Sequence[str]) -> tuple[str, str]:
     **Raises:** `InputError` if its name does not contain two of them.
     """
     stem = path.stem.removesuffix("-clean")
-    for first in sorted(names, key=len, reverse=True):
-        for second in names:
-            pair = f"{first}__{second}"
+    for first_name in sorted(names, key=len, reverse=True):
+        for second_name in names:
+            pair = f"{first_name}__{second_name}"
             if stem == pair or stem.endswith(f"-{pair}"):
-                return first, second
+                return first_name, second_name
     raise InputError(
         f"{path}: the name of a match file is PREFIX-IMAGE1__IMAGE2.match; no two images of "
         f"[images] ({', '.join(names)}, ids or names of their files) are in {show(path.name)}"
@@ -162,19 +162,21 @@ def join_matches(
     from scipy.sparse.csgraph import connected_components
 
     ends = [np.c_[np.full(len(xy), i), xy] for i, j, a, b in pairs for i, xy in ((i, a), (j, b))]
-    places, at = np.unique(np.concatenate(ends), axis=0, return_inverse=True)
+    places, place_numbers = np.unique(np.concatenate(ends), axis=0, return_inverse=True)
     # The same numbers of both ends of every pair.
-    sides = np.split(at.ravel(), np.cumsum([len(rows) for rows in ends])[:-1])
-    first, second = (np.concatenate(sides[k::2]) for k in (0, 1))
+    sides = np.split(place_numbers.ravel(), np.cumsum([len(rows) for rows in ends])[:-1])
+    first_side, second_side = (np.concatenate(sides[k::2]) for k in (0, 1))
     shape = (len(places), len(places))
-    graph = coo_array((np.ones(len(first)), (first, second)), shape)
+    graph = coo_array((np.ones(len(first_side)), (first_side, second_side)), shape)
     _, point = connected_components(graph, directed=False)
     image = places[:, 0].astype(int)
     # Two places in one image are not one point.
     _, counts = np.unique(np.c_[point, image], axis=0, return_counts=True)
     twice = np.unique(np.c_[point, image], axis=0)[counts > 1, 0]
-    kept = ~np.isin(point, twice)
-    _, renumbered = np.unique(point[kept], return_inverse=True)
-    order = np.argsort(image[kept], kind="stable")
+    is_kept = ~np.isin(point, twice)
+    _, renumbered = np.unique(point[is_kept], return_inverse=True)
+    order = np.argsort(image[is_kept], kind="stable")
     left_out = len(np.unique(twice))
-    return JoinedMatches(image[kept][order], renumbered[order], places[kept, 1:][order], left_out)
+    return JoinedMatches(
+        image[is_kept][order], renumbered[order], places[is_kept, 1:][order], left_out
+    )

@@ -121,8 +121,8 @@ def read_csm(
         sources=states.sources,
     )
     name = str(isd.get("name_sensor") or Path(path).stem)
-    told = (*states.warnings, *unknown.messages())
-    return ScannerInput(name, image, _earth(isd), told, backwards)
+    messages = (*states.warnings, *unknown.messages())
+    return ScannerInput(name, image, _earth(isd), messages, backwards)
 
 
 def _read_support_data(path: Path, unknown: UnknownKeys) -> tuple[JsonFields, int]:
@@ -199,11 +199,11 @@ def _line_times(isd: JsonFields, lines: int) -> tuple[LineTimes, bool]:
         raise InputError(
             f"{isd.path}: line_scan_rate needs rows of a positive period, or all of a negative one"
         )
-    first, start, period = (rates * np.array([1, -1, -1]) if backwards else rates).T
+    first_line, start, period = (rates * np.array([1, -1, -1]) if backwards else rates).T
     # The centre of line l is l + ½ in the coordinates of the ISD.
     l = np.arange(lines)
-    row = np.clip(np.searchsorted(first, l + 0.5, side="right") - 1, 0, None)
-    t = start[row] + period[row] * (l + 1 - first[row])
+    row = np.clip(np.searchsorted(first_line, l + 0.5, side="right") - 1, 0, None)
+    t = start[row] + period[row] * (l + 1 - first_line[row])
     # One rate: times follow from it, and need no table.
     if (row == row[0]).all():
         return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]])), backwards

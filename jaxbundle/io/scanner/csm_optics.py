@@ -42,8 +42,8 @@ def optics_of(
     if kind == "radial" and f > 0 and straight:
         K = -isd.array("optical_distortion.radial.coefficients", (None,))
         model = get_model("usgs")
-        given = {"c": f, **{f"K{k}": value for k, value in enumerate(K)}}
-        parameters = jnp.asarray([given.get(name, 0.0) for name in model.parameters])
+        by_name = {"c": f, **{f"K{k}": value for k, value in enumerate(K)}}
+        parameters = jnp.asarray([by_name.get(name, 0.0) for name in model.parameters])
         pitch, middle, row = (jnp.asarray(v) for v in (pitch, -X[0] / pitch, Y[0]))
         return FocalLine(parameters, pitch, middle, row, "usgs"), frame.turn
     psi = np.arctan(frame.slopes(*undistorted) / f)
@@ -103,9 +103,9 @@ def _distortion(
             a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
             a, b = (np.r_[c, np.zeros(10)][:10] for c in (a, b))
             return kind, _transverse(isd, a, b, x, y)
-    known = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
+    known_kinds = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} is not supported; expected {known}"
+        f"{isd.path}: optical_distortion {show(kind)} is not supported; expected {known_kinds}"
     )
 
 

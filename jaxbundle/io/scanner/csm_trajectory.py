@@ -143,13 +143,13 @@ def poses_at(
     of_table = lambda t: t if len(t) == 1 else when
     if len(position_times) == 1:
         scale = unit_of(isd, "instrument_position", "km")
-        inertial, said = scale * isd.array("instrument_position.positions", (1, 3)), ()
+        inertial, messages = scale * isd.array("instrument_position.positions", (1, 3)), ()
     else:
-        at, said = _positions(isd, position_times)
-        inertial = at(when)
+        position_at, messages = _positions(isd, position_times)
+        inertial = position_at(when)
     X0 = body(of_table(position_times)).apply(inertial)
     R = body(of_table(times)) * pointing(of_table(times)).inv()
-    return X0, R, (*body_lengths, *lengths, *said)
+    return X0, R, (*body_lengths, *lengths, *messages)
 
 
 def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
@@ -157,10 +157,10 @@ def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int
     q = np.roll((states.R * turn).as_quat(), 1, axis=1)
 
     def options(k: int, n: int) -> dict[str, Any]:
-        least = order if interpolation == "usgscsm" else min(order, n - 1)
+        smallest_order = order if interpolation == "usgscsm" else min(order, n - 1)
         return {
             "method": interpolation,
-            "order": least,
+            "order": smallest_order,
             "gap": np.inf,
             "extrapolate": states.extrapolate[k],
             "source": states.sources[k],
@@ -190,9 +190,11 @@ def view_directions(
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Approximate directions down and of flight in the camera frame: they only decide which axis
     is which, so that linear interpolation and a difference over a millisecond suffice."""
-    here, after = (np.array([np.interp(time + dt, t, p) for p in P.T]) for dt in (0, 1e-3))
+    position, position_after = (
+        np.array([np.interp(time + dt, t, p) for p in P.T]) for dt in (0, 1e-3)
+    )
     camera = slerp(rows, R, np.array([time]))[0].inv()
-    return camera.apply(-here), camera.apply(after - here)
+    return camera.apply(-position), camera.apply(position_after - position)
 
 
 def _read_even_table(
@@ -206,7 +208,9 @@ def _read_even_table(
         t = isd.number(f"t0_{name}") + isd.number(f"dt_{name}") * np.arange(n)
         _check_rows(isd, f"sensor_{key}", t)
         tables.append((t, isd.source(f"sensor_{key}")))
-    warnings = [w for t, at in tables for w in warn_of_extrapolation(t, lines, at, settings)]
+    warnings = [
+        w for t, times_at in tables for w in warn_of_extrapolation(t, lines, times_at, settings)
+    ]
     (t, rows), sources = zip(*tables)
     R, lengths = _rotations(isd, "sensor_orientation", q)
     limits = extrapolation_limit(t, settings), extrapolation_limit(rows, settings)
@@ -244,14 +248,14 @@ def _resample(
         merged = np.union1d(body_times, pointing_times)
         if len(merged) == 1:
             merged = merged + [0.0, 1.0]
-        both = body(merged) * pointing(merged).inv()
+        both_rotations = body(merged) * pointing(merged).inv()
         rows = np.linspace(merged[0], merged[-1], len(merged))
-        R = slerp(merged, both, rows)
+        R = slerp(merged, both_rotations, rows)
     else:
         rows = np.linspace(pointing_times[0], pointing_times[-1], max(2, len(pointing_times)))
         R = body(rows) * pointing(rows).inv()
-    allowed = partial(extrapolation_limit, settings=settings)
-    limits = allowed(position_times), allowed(pointing_times)
+    limit_of = partial(extrapolation_limit, settings=settings)
+    limits = limit_of(position_times), limit_of(pointing_times)
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
     lengths = *body_lengths, *pointing_lengths
     return States(t, P, rows, R, limits, sources, (*lengths, *contradicted, *warnings))
@@ -269,19 +273,19 @@ def _positions(
     """Positions in the inertial frame, metres, at times; warnings."""
     scale = unit_of(isd, "instrument_position", "km")
     P = scale * isd.array("instrument_position.positions", (len(t), 3))
-    said: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     if isd.get("instrument_position.velocities") is not None:
         V = scale * isd.array("instrument_position.velocities", (len(t), 3))
         wrong = contradiction(t, P, V, isd.source("instrument_position.velocities"))
         # Orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does.
-        used = wrong is None or wrong.shift < 100
+        is_used = wrong is None or wrong.shift < 100
         if wrong is not None:
-            todo = "used all the same" if used else "not used; positions are interpolated alone"
-            said = (f"{wrong.message}: up to {wrong.shift:.2g} m between the rows; {todo}",)
-        if used:
-            return CubicHermiteSpline(t, P, V), said
+            todo = "used all the same" if is_used else "not used; positions are interpolated alone"
+            messages = (f"{wrong.message}: up to {wrong.shift:.2g} m between the rows; {todo}",)
+        if is_used:
+            return CubicHermiteSpline(t, P, V), messages
     table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
-    return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times)), said
+    return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times)), messages
 
 
 def _times(isd: JsonFields, key: str) -> Float[np.ndarray, " n"]:
@@ -303,8 +307,8 @@ def _turns(isd: JsonFields, key: str) -> tuple[Float[np.ndarray, " n"], Turns, t
         )
     constant = Rotation.from_matrix(fixed)
     if len(t) == 1:
-        given = isd.get(f"{key}.angular_velocities") is not None  # null where they are unknown
-        rate = isd.array(f"{key}.angular_velocities", (1, 3))[0] if given else np.zeros(3)
+        has_rates = isd.get(f"{key}.angular_velocities") is not None  # null where they are unknown
+        rate = isd.array(f"{key}.angular_velocities", (1, 3))[0] if has_rates else np.zeros(3)
         turned = lambda times: constant * Rotation.from_rotvec(np.outer(times - t[0], rate)) * R[0]
         return t, turned, lengths
     return t, lambda times: constant * slerp(t, R, times), lengths

@@ -85,21 +85,21 @@ def write_csm_state(
     """
     if earth is None or earth.a != earth.b:
         raise InputError(f"{path}: a model state needs an ellipsoid of revolution")
-    first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
-    first, last = np.clip([first, last], *_covered(image))
+    begin, end = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    begin, end = np.clip([begin, end], *_covered(image))
     distance = _distance(image, earth, height)
     sights = _sights(image, earth, height)
-    given = _Source(image, earth, height, sights)
+    source = _Source(image, earth, height, sights)
     # 16 intervals of a second: usual tables have 1 to 100 rows a second
-    intervals = int(max(16, np.ceil(16 * (last - first))))
+    intervals = int(max(16, np.ceil(16 * (end - begin))))
     best = None
     while best is None or 2 * intervals <= max_rows:
-        t, P, R = _tables(given, first, last, intervals)
-        between = first + (last - first) * (np.arange(intervals) + 0.5) / intervals
-        truth = _poses(given, between)
+        t, P, R = _tables(source, begin, end, intervals)
+        times_between = begin + (end - begin) * (np.arange(intervals) + 0.5) / intervals
+        truth = _poses(source, times_between)
         # Of the middles of intervals, in which the error is largest.
-        P_found = _between(t, P - P[0], between) + P[0]
-        R_found = Rotation.from_quat(_between(t, R.as_quat(), between))
+        P_found = _between(t, P - P[0], times_between) + P[0]
+        R_found = Rotation.from_quat(_between(t, R.as_quat(), times_between))
         wrong = np.linalg.norm(P_found - truth[0], axis=1).max()
         wrong += distance * (R_found.inv() * Rotation.from_matrix(truth[1])).magnitude().max()
         wrong += len(t) * np.finfo(float).eps / 2 * np.linalg.norm(P[0])
@@ -112,7 +112,7 @@ def write_csm_state(
     assert best is not None
     trajectory, *tables = best
     optics, tangent = _optics(sights)
-    corrections = _corrections_left(given)
+    corrections = _corrections_left(source)
     lens = tangent * distance
     fit = StateFit(trajectory + lens + corrections, trajectory, lens, corrections, len(tables[0]))
     state = _state(image, earth, (tables[0], tables[1], tables[2]), name) | optics
@@ -129,27 +129,27 @@ def _covered(image: PushbroomImage) -> tuple[float, float]:
 
 
 def _tables(
-    given: _Source, first: float, last: float, n: int
+    source: _Source, begin: float, end: float, n: int
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows 3"], Rotation]:
     """Rows of the image and `BEYOND` on each side, continued where the image has none."""
-    step = (last - first) / n
-    t = first + step * np.arange(-BEYOND, n + BEYOND + 1)
-    low, high = _covered(given.image)
+    step = (end - begin) / n
+    t = begin + step * np.arange(-BEYOND, n + BEYOND + 1)
+    low, high = _covered(source.image)
     # Rounding of the ends.
-    inside = (t >= low - 1e-9 * step) & (t <= high + 1e-9 * step)
+    is_inside = (t >= low - 1e-9 * step) & (t <= high + 1e-9 * step)
     P, R = np.full((len(t), 3), np.nan), np.full((len(t), 3, 3), np.nan)
-    P[inside], R[inside] = _poses(given, np.clip(t[inside], low, high))
-    q = Rotation.from_matrix(np.where(inside[:, None, None], R, np.eye(3))).as_quat()
+    P[is_inside], R[is_inside] = _poses(source, np.clip(t[is_inside], low, high))
+    q = Rotation.from_matrix(np.where(is_inside[:, None, None], R, np.eye(3))).as_quat()
     # One sign along the table: q and −q are the same rotation.
-    for k in np.flatnonzero(inside)[1:]:
+    for k in np.flatnonzero(is_inside)[1:]:
         q[k] *= np.sign(q[k] @ q[k - 1]) or 1.0
-    known = np.flatnonzero(inside)
+    known_rows = np.flatnonzero(is_inside)
     for values in (P, q):
-        origin = values[known[0]].copy()
-        for k in np.flatnonzero(~inside):
-            near = known[:5] if k < known[0] else known[-5:]
+        origin = values[known_rows[0]].copy()
+        for k in np.flatnonzero(~is_inside):
+            nearest_rows = known_rows[:5] if k < known_rows[0] else known_rows[-5:]
             # Of degree 4: a row of the tables is a thousandth of an orbit or of a jitter.
-            values[k] = origin + _lagrange(t[near], values[near] - origin, t[k])
+            values[k] = origin + _lagrange(t[nearest_rows], values[nearest_rows] - origin, t[k])
     return t, P, Rotation.from_quat(q)
 
 
@@ -168,32 +168,40 @@ def _between(
     return np.einsum("j,njk->nk", weights, values[i[:, None] + k])
 
 
-def _weights(nodes: Float[np.ndarray, " n"], at: float) -> Float[np.ndarray, " n"]:
+def _weights(nodes: Float[np.ndarray, " n"], place: float) -> Float[np.ndarray, " n"]:
     """Lagrange's weights of nodes at a place."""
     return np.array(
         [
-            np.prod([(at - other) / (node - other) for other in nodes if other != node])
+            np.prod(
+                [
+                    (place - other_node) / (node - other_node)
+                    for other_node in nodes
+                    if other_node != node
+                ]
+            )
             for node in nodes
         ]
     )
 
 
 def _lagrange(
-    t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], at: float
+    t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], place: float
 ) -> Float[np.ndarray, " k"]:
-    return _weights((t - t[0]) / (t[1] - t[0]), (at - t[0]) / (t[1] - t[0])) @ values
+    return _weights((t - t[0]) / (t[1] - t[0]), (place - t[0]) / (t[1] - t[0])) @ values
 
 
 def _poses(
-    given: _Source, times: Float[np.ndarray, " n"]
+    source: _Source, times: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """P and R, camera → Earth-fixed, that a model without corrections needs."""
     # Of few shapes, so that few programs are compiled.
     size = 256 << max(int(np.ceil(np.log2(len(times) / 256))), 0)
     padded = np.asarray(times)[np.minimum(np.arange(size), len(times) - 1)]
-    u = _some_pixels(given.image)
-    P, R, d = (np.asarray(a)[: len(times)] for a in _rays(*given[:3], padded, u))
-    return P, _turn_best(d, _unit_sights(given.sights[:, u])) if given.image.corrections.any else R
+    u = _some_pixels(source.image)
+    P, R, d = (np.asarray(a)[: len(times)] for a in _rays(*source[:3], padded, u))
+    return P, _turn_best(
+        d, _unit_sights(source.sights[:, u])
+    ) if source.image.corrections.any else R
 
 
 def _some_pixels(image: PushbroomImage) -> np.ndarray:
@@ -253,20 +261,20 @@ def _sights(
     return np.stack([-r / q, -s / q])
 
 
-def _corrections_left(given: _Source) -> float:
+def _corrections_left(source: _Source) -> float:
     """Metres on the ground that the corrections differ from a rotation of each line, 500 m higher
     and lower, too."""
-    image, earth, height, sights = given
+    image, earth, height, sights = source
     if not image.corrections.any:
         return 0.0
-    first, last = (float(image.times.time(line)) for line in (0.0, image.lines - 1.0))
-    times, u = np.linspace(first, last, 9), _some_pixels(image)
-    _, R = _poses(given, times)
-    along = np.einsum("nij,kj->nki", R, _unit_sights(sights[:, u]))
+    begin, end = (float(image.times.time(line)) for line in (0.0, image.lines - 1.0))
+    times, u = np.linspace(begin, end, 9), _some_pixels(image)
+    _, R = _poses(source, times)
+    sights_in_space = np.einsum("nij,kj->nki", R, _unit_sights(sights[:, u]))
     worst = 0.0
     for level in (height - 500.0, height, height + 500.0):
         d = np.asarray(_rays(image, earth, level, times, u)[2])
-        angle = np.linalg.norm(np.cross(along, d), axis=2).max()
+        angle = np.linalg.norm(np.cross(sights_in_space, d), axis=2).max()
         worst = max(worst, float(angle) * _distance(image, earth, level))
     return worst
 
@@ -311,16 +319,18 @@ def _optics(sights: Float[np.ndarray, "2 pixels"]) -> tuple[dict[str, Any], floa
         fields = {"m_detectorLineOrigin": -row, "m_distortionType": 0}
         return common | fields | {"m_opticalDistCoeffs": [0.0, 0.0, 0.0]}, straight / f
     # Distorted x = a(x), y = y − b(x) = 0: cubics of the undistorted x, in units of the half line.
-    half = max(np.abs(x).max(), 1.0)
-    powers = np.stack([(x / half) ** k for k in range(4)], 1)
-    scale = half ** np.arange(4)
+    half_width = max(np.abs(x).max(), 1.0)
+    powers = np.stack([(x / half_width) ** k for k in range(4)], 1)
+    scale = half_width ** np.arange(4)
     a, b = (np.linalg.lstsq(powers, v, rcond=None)[0] for v in (distorted, y))
-    left = np.hypot(powers @ a - distorted, powers @ b - y).max()
+    largest_error = np.hypot(powers @ a - distorted, powers @ b - y).max()
     terms = np.zeros((2, 10))
     terms[0, [0, 1, 3, 6]], terms[1, [0, 1, 3, 6]] = a / scale, -b / scale
     terms[1, 2] = 1.0
     fields = {"m_detectorLineOrigin": 0.0, "m_distortionType": 1}
-    return common | fields | {"m_opticalDistCoeffs": terms.ravel().tolist()}, float(left / f)
+    return common | fields | {"m_opticalDistCoeffs": terms.ravel().tolist()}, float(
+        largest_error / f
+    )
 
 
 def _state(
@@ -381,10 +391,10 @@ def _line_times(image: PushbroomImage) -> tuple[list[float], list[float], list[f
     # Parts end where the time of a line is not that of its part, to a nanosecond: 8 µm of a track.
     lines, k = [0], 0
     while k < len(t):
-        off = np.abs(t[k:] - t[k] - steps[k] * np.arange(len(t) - k)) > 1e-9
-        if not off.any():
+        is_off = np.abs(t[k:] - t[k] - steps[k] * np.arange(len(t) - k)) > 1e-9
+        if not is_off.any():
             break
-        k += int(off.argmax())
+        k += int(is_off.argmax())
         lines.append(k)
     return [k + 1.0 for k in lines], t[lines].tolist(), steps[lines].tolist()
 
@@ -396,13 +406,13 @@ def _description(
     times = [float(image.times.time(line)) for line in (0.0, image.lines - 1.0)]
     surface = Height(level=height, earth=earth)
     pose = pose_at(image, image.middle_time)
-    at = lambda u: np.stack(
+    ground_at = lambda u: np.stack(
         [*ground_point(pose, image.optics.slopes(u), surface, image.corrections)]
     )
-    ends = at(0.0), at(image.pixels - 1.0)
+    ends = ground_at(0.0), ground_at(image.pixels - 1.0)
     swath = float(np.linalg.norm(ends[1] - ends[0]))
     return {
-        "m_referencePointXyz": at((image.pixels - 1) / 2).tolist(),
+        "m_referencePointXyz": ground_at((image.pixels - 1) / 2).tolist(),
         "m_gsd": swath / (image.pixels - 1),
         "m_halfSwath": swath / 2,
         "m_halfTime": (times[1] - times[0]) / 2,

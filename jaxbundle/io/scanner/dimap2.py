@@ -111,8 +111,8 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
     P = np.array([_read_location(file, names.location, e, k) for k, e in points])
     positions = Source(f"{path}, Point_List", None, "point")
     attitude = Source(f"{path}, Attitudes", None, "quaternion")
-    last = period * (lines - 1)
-    rows, R, lengths = _attitudes(file, names, epoch, last, attitude)
+    last_time = period * (lines - 1)
+    rows, R, lengths = _attitudes(file, names, epoch, last_time, attitude)
     for times_of, source in ((t, positions), (rows, attitude)):
         if len(times_of) < 2:
             raise InputError(f"{source.name}: {len(times_of)} row; 2 at least")
@@ -122,9 +122,9 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
     u = np.arange(pixels)
     # The optics are polynomials about a mean direction in the middle of the image.
     frame = sight_frame(
-        np.stack([np.polyval(p[::-1], u) for p in (y, -x)]), *tables.directions(last / 2)
+        np.stack([np.polyval(p[::-1], u) for p in (y, -x)]), *tables.directions(last_time / 2)
     )
-    trajectory, told = trajectory_of(tables, frame.turn, period * np.arange(lines))
+    trajectory, messages = trajectory_of(tables, frame.turn, period * np.arange(lines))
     image = make_image(
         trajectory,
         times,
@@ -134,7 +134,7 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
         sources=(positions, attitude),
     )
     name = file.text("Dataset_Identification/DATASET_NAME", path.stem)
-    return ScannerInput(name, image, WGS84, (*lengths, *warnings, *told, *unknown.messages()))
+    return ScannerInput(name, image, WGS84, (*lengths, *warnings, *messages, *unknown.messages()))
 
 
 def _check_level(file: XmlFields) -> None:
@@ -150,36 +150,37 @@ def _check_level(file: XmlFields) -> None:
 
 def _unit(file: XmlFields, element: ET.Element | None, units: dict[str, float]) -> float | None:
     """The unit that an element states; None if it states none."""
-    said = None if element is None else element.get("unit")
-    if element is None or said is None:
+    unit_word = None if element is None else element.get("unit")
+    if element is None or unit_word is None:
         return None
-    if said.strip().lower() not in units:
+    if unit_word.strip().lower() not in units:
         raise InputError(
-            f"{file.path}: {element.tag} is in {show(said)}; expected one of {', '.join(units)}"
+            f"{file.path}: {element.tag} is in {show(unit_word)}; expected one of "
+            f"{', '.join(units)}"
         )
-    return units[said.strip().lower()]
+    return units[unit_word.strip().lower()]
 
 
 def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> float:
     """The period of the lines in seconds."""
     period = file.number(names.period)
-    stated = _unit(file, file.find(names.period), TIME_UNITS)
-    if stated is not None and period > 0:
-        return stated * period
+    stated_unit = _unit(file, file.find(names.period), TIME_UNITS)
+    if stated_unit is not None and period > 0:
+        return stated_unit * period
     span = seconds(file.time(f"{names.range}/END"), epoch)
     # 5 % and a line: not critical, since the units are a factor of 1000 apart
     fits = lambda unit: (
         period > 0 and abs(unit * period * (lines - 0.5) - span) <= 0.05 * span + unit * period
     )
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
-    known = (PROFILES[profile],) if profile in PROFILES else ()
+    known_units = (PROFILES[profile],) if profile in PROFILES else ()
     # With few lines several units fit: that of the product is tried first.
-    for unit in (*known, 1.0, 1e-3, 1e-6):
+    for unit in (*known_units, 1.0, 1e-3, 1e-6):
         if fits(unit):
             return unit * period
     # Where START and END contradict it: the unit documented for the product.
-    if known and period > 0:
-        return known[0] * period
+    if known_units and period > 0:
+        return known_units[0] * period
     name = names.period.rpartition("/")[2]
     raise InputError(
         f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; "
@@ -202,17 +203,17 @@ Attitudes = tuple[Float[np.ndarray, " n"], Rotation, tuple[str, ...]]
 
 
 def _attitudes(
-    file: XmlFields, names: Names, epoch: np.datetime64, last: float, source: Source
+    file: XmlFields, names: Names, epoch: np.datetime64, last_time: float, source: Source
 ) -> Attitudes:
     if names is EARLY or file.find(names.polynomials) is not None:
-        return _polynomial(file, names, epoch, last, source)
+        return _polynomial(file, names, epoch, last_time, source)
     key = f"{MODEL}/Attitudes/Quaternion_List/Quaternion"
     values = file.columns(key, ("Q0", "Q1", "Q2", "Q3"))
     return file.times(key, epoch), *_rotations(values, source)
 
 
 def _polynomial(
-    file: XmlFields, names: Names, epoch: np.datetime64, last: float, source: Source
+    file: XmlFields, names: Names, epoch: np.datetime64, last_time: float, source: Source
 ) -> Attitudes:
     """The attitudes of a polynomial, as a table from a second before the image to one after."""
     key = names.polynomials
@@ -225,7 +226,7 @@ def _polynomial(
         raise InputError(f"{file.path}: SCALE of {key.rpartition('/')[2]} is 0")
     # Through eight rows Lagrange's polynomial of degree 7 is exact for those of low degree;
     # the division by their length is no polynomial, and the reason for more rows.
-    rows = np.linspace(-1.0, last + 1.0, 65)
+    rows = np.linspace(-1.0, last_time + 1.0, 65)
     parts = [file.numbers(names.coefficients.format(k)) for k in range(4)]
     values = np.stack([np.polyval(c[::-1], (rows - offset) / scale) for c in parts], 1)
     return rows, *_rotations(values, source)
@@ -261,8 +262,8 @@ def _look_angles(
             rows = [f"{angles}/{axis}LOS_{k}" for k in range(4)]
             values = [file.number(row, None if k == 0 else 0.0) for k, row in enumerate(rows)]
         # ψ(u + u₀) as a polynomial of u
-        moved = np.polynomial.Polynomial(values)(np.polynomial.Polynomial([shift, 1.0])).coef
-        polynomials.append(np.r_[moved, np.zeros(4 - len(moved))])
+        shifted = np.polynomial.Polynomial(values)(np.polynomial.Polynomial([shift, 1.0])).coef
+        polynomials.append(np.r_[shifted, np.zeros(4 - len(shifted))])
     warnings = []
     if len(bands) > 1:
         warnings.append(

@@ -45,10 +45,10 @@ def trajectory_of(
     warnings: list[str] = []
 
     def options(rows: Float[np.ndarray, " n"], source: Source) -> dict[str, Any]:
-        told = warn_of_extrapolation(rows, lines, source)
-        warnings.extend(told)
+        extrapolation_warnings = warn_of_extrapolation(rows, lines, source)
+        warnings.extend(extrapolation_warnings)
         return {
-            "method": "usgscsm" if told else "lagrange",
+            "method": "usgscsm" if extrapolation_warnings else "lagrange",
             "order": min(LAGRANGE_ORDER, len(rows) - 1),
             "gap": np.inf,
             "extrapolate": extrapolation_limit(rows),

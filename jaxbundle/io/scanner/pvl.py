@@ -66,7 +66,7 @@ def _read(path: Path, root: ET.Element) -> None:
         end = text.find(";", match.end())
         if end < 0 or not re.fullmatch(r"\w+", name):
             raise wrong("expected NAME = value;")
-        _put(groups[-1], name, text[match.end() : end].strip())
+        _add_value(groups[-1], name, text[match.end() : end].strip())
         begin = end + 1
     if len(groups) > 1:
         raise InputError(f"{path}: the group {groups[-1].tag} does not end")
@@ -74,11 +74,11 @@ def _read(path: Path, root: ET.Element) -> None:
 
 def without_comments(text: str) -> str:
     """PVL without its comments; every line keeps its number."""
-    blank = lambda found: found[0] if found[0][0] == '"' else "\n" * found[0].count("\n")
+    blank = lambda match: match[0] if match[0][0] == '"' else "\n" * match[0].count("\n")
     return TEXT_OR_COMMENT.sub(blank, text)
 
 
-def _put(group: ET.Element, name: str, value: str) -> None:
+def _add_value(group: ET.Element, name: str, value: str) -> None:
     """A value; a list as NAMEList with NAME for each row."""
     if not value.startswith("("):
         ET.SubElement(group, name).text = value.strip('"')

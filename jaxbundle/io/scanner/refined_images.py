@@ -33,11 +33,14 @@ def names_of_images(file: RefineFile) -> list[str]:
     """The possible files of all images of a refine file."""
     return [
         name
-        for one in file.images
+        for scanner_image in file.images
         for name in (
-            [f"{one.id}{file.rpc_ending}"]
-            if isinstance(one, RpcScannerImage)
-            else [*names_of(one.id), *([f"{one.id}{STATE_ENDING}"] if file.csm_states else [])]
+            [f"{scanner_image.id}{file.rpc_ending}"]
+            if isinstance(scanner_image, RpcScannerImage)
+            else [
+                *names_of(scanner_image.id),
+                *([f"{scanner_image.id}{STATE_ENDING}"] if file.csm_states else []),
+            ]
         )
     ]
 
@@ -46,16 +49,16 @@ def write_images(folder: Path, file: RefineFile, result: Refinement) -> dict[str
     """Write the refined images into a folder; returns how well model states fit, by image."""
     fits = {}
     heights = _mean_height(result)
-    for one in file.images:
-        image = result.image(one.id)
+    for scanner_image in file.images:
+        image = result.image(scanner_image.id)
         if isinstance(image, RpcImage):
-            write_rpc(folder / f"{one.id}{file.rpc_ending}", image.rpc)
+            write_rpc(folder / f"{scanner_image.id}{file.rpc_ending}", image.rpc)
         else:
-            write_scanner_image(folder, one.id, image, one.earth)
+            write_scanner_image(folder, scanner_image.id, image, scanner_image.earth)
             if file.csm_states:
-                path = folder / f"{one.id}{STATE_ENDING}"
-                fits[one.id] = write_csm_state(
-                    path, _without_corners(image), one.earth, heights, one.id
+                path = folder / f"{scanner_image.id}{STATE_ENDING}"
+                fits[scanner_image.id] = write_csm_state(
+                    path, _without_corners(image), scanner_image.earth, heights, scanner_image.id
                 )
     return fits
 
@@ -73,7 +76,14 @@ def describe_states(fits: dict[str, StateFit]) -> Iterator[str]:
 
 def _mean_height(result: Refinement) -> float:
     """The mean height of the points, where the corrections of states hold."""
-    earth = next((one.earth for one in result.inputs.rigorous if one.earth is not None), None)
+    earth = next(
+        (
+            scanner_image.earth
+            for scanner_image in result.inputs.rigorous
+            if scanner_image.earth is not None
+        ),
+        None,
+    )
     X = np.asarray(result.positions)
     if earth is None or not len(X):
         return 0.0
@@ -93,8 +103,12 @@ def _without_corners(image: PushbroomImage) -> PushbroomImage:
     middle = middle[(middle > low) & (middle < high)]
     if len(times) < 8 or not len(middle):
         return image
-    one, other = (np.asarray(_rotations(a, middle)) for a in (attitude, smooth))
-    turn = np.linalg.norm(one - other, axis=(1, 2)) / np.sqrt(2)  # of small rotations
+    rotations_given, rotations_smooth = (
+        np.asarray(_rotations(a, middle)) for a in (attitude, smooth)
+    )
+    turn = np.linalg.norm(rotations_given - rotations_smooth, axis=(1, 2)) / np.sqrt(
+        2
+    )  # of small rotations
     if not turn.max() < 2e-9:
         return image
     return eqx.tree_at(lambda i: i.trajectory.attitude, image, smooth)
@@ -105,10 +119,10 @@ _rotations = compile_once(jax.vmap(attitude_at, (None, 0)))
 
 def describe_refits(result: Refinement) -> Iterator[str]:
     """Images whose compensated coefficients do not contain all of their bias, as warnings."""
-    for one in result.inputs.rpc:
-        check = result.compensated[one.id][1]
+    for rpc_image in result.inputs.rpc:
+        check = result.compensated[rpc_image.id][1]
         if check is not None and check.largest.max() > LARGEST_REFIT:
             yield (
-                f"image {one.id!r}: its compensated coefficients are up to "
+                f"image {rpc_image.id!r}: its compensated coefficients are up to "
                 f"{check.largest.max():.2g} pixels off its bias; give a lower bias_degree"
             )

@@ -66,19 +66,23 @@ class RefinedBlock:
 
     def image_of(self, file: Path) -> RefinedFile | None:
         """The image of a refined file, if it is one of them."""
-        return next((one for one in self.images if one.file.name == file.name), None)
+        return next(
+            (refined_file for refined_file in self.images if refined_file.file.name == file.name),
+            None,
+        )
 
 
 def joint_covariance(result: Refinement) -> OrientationCovariance | None:
     """The covariance of the unknowns of all scanner images and their sensors, a posteriori; None:
     all are held."""
     unknowns = [_unknown_of(name) for name in result.names]
-    used = [k for k, unknown in enumerate(unknowns) if unknown is not None]
+    known_rows = [k for k, unknown in enumerate(unknowns) if unknown is not None]
     C: Float[np.ndarray, "m m"] = result.covariance
-    if not used:
+    if not known_rows:
         return None
     return OrientationCovariance(
-        tuple(one for one in unknowns if one is not None), C[np.ix_(used, used)]
+        tuple(known_unknown for known_unknown in unknowns if known_unknown is not None),
+        C[np.ix_(known_rows, known_rows)],
     )
 
 
@@ -93,16 +97,39 @@ def write_refined_orientations(
 ) -> None:
     """Write table and covariance into a folder, whose place will be `place`."""
     rows = []
-    for one in file.images:
-        raster = find_raster(file.sources[one.id])
+    for scanner_image in file.images:
+        raster = find_raster(file.sources[scanner_image.id])
         # From where the folder will be: now it has a temporary name.
-        known = "" if raster is None else relative_path(raster, place)
-        if isinstance(one, RpcScannerImage):
-            domain = domain_of_bias(one.image.rpc)
-            rows.append((one.id, f"{one.id}{file.rpc_ending}", known, "", "", *domain))
+        raster_path = "" if raster is None else relative_path(raster, place)
+        if isinstance(scanner_image, RpcScannerImage):
+            domain = domain_of_bias(scanner_image.image.rpc)
+            rows.append(
+                (
+                    scanner_image.id,
+                    f"{scanner_image.id}{file.rpc_ending}",
+                    raster_path,
+                    "",
+                    "",
+                    *domain,
+                )
+            )
         else:
-            more = one.sensor or one.id, one.freedom.knot_spacing
-            rows.append((one.id, f"{one.id}.toml", known, *more, "", "", "", ""))
+            sensor_and_spacing = (
+                scanner_image.sensor or scanner_image.id,
+                scanner_image.freedom.knot_spacing,
+            )
+            rows.append(
+                (
+                    scanner_image.id,
+                    f"{scanner_image.id}.toml",
+                    raster_path,
+                    *sensor_and_spacing,
+                    "",
+                    "",
+                    "",
+                    "",
+                )
+            )
     write_csv(folder / TABLE, HEAD, rows)
     covariance = joint_covariance(result)
     if covariance is not None:
@@ -148,7 +175,9 @@ def read_refined_orientations(folder: Path) -> RefinedBlock | None:
 
 def _check_owners(path: Path, images: list[RefinedFile], covariance: OrientationCovariance) -> None:
     """Refuse unknowns of images that are not there: the σ would be too small."""
-    owners = {("image", one.id) for one in images} | {("sensor", one.sensor) for one in images}
+    owners = {("image", scanner_image.id) for scanner_image in images} | {
+        ("sensor", scanner_image.sensor) for scanner_image in images
+    }
     covered = {(kind, id) for kind, id, _ in covariance.unknowns}
     strange = sorted(f"{kind} {id}" for kind, id in covered - owners)
     if strange:

@@ -139,9 +139,15 @@ def read_refinement(path: str | Path) -> RefineFile:
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
     # Other programs name an image by its file, without folder and suffix.
-    sources = {one.id: file.section("images").path(one.id, "an image") for one in images}
-    names = {re.sub("(?i)_rpc$", "", sources[one.id].stem): one.id for one in images}
-    names |= {one.id: one.id for one in images}
+    sources = {
+        scanner_image.id: file.section("images").path(scanner_image.id, "an image")
+        for scanner_image in images
+    }
+    names = {
+        re.sub("(?i)_rpc$", "", sources[scanner_image.id].stem): scanner_image.id
+        for scanner_image in images
+    }
+    names |= {scanner_image.id: scanner_image.id for scanner_image in images}
     serial = file.section("serial_numbers")
     for id in serial.values:
         if id not in sources:
@@ -153,8 +159,8 @@ def read_refinement(path: str | Path) -> RefineFile:
                 "every image has a serial number of its own"
             )
         names[number] = id
-    points, observations, said = read_points(section, names, images, frames, radians)
-    warnings += said
+    points, observations, point_warnings = read_points(section, names, images, frames, radians)
+    warnings += point_warnings
     snooping = section.text("snooping", "none")
     if snooping not in TESTS:
         raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
@@ -185,16 +191,20 @@ def read_refinement(path: str | Path) -> RefineFile:
 
 def _wants_states(section: TomlSection, images: Sequence[AnyScannerImage]) -> bool:
     """Whether rigorous images are written as model states."""
-    wanted = section.values.get("csm_states", False)
-    if not isinstance(wanted, bool):
-        raise InputError(f"{section.where}csm_states is {wanted!r}; expected true or false")
-    local = [one.id for one in images if isinstance(one, ScannerImage) and one.earth is None]
-    if wanted and local:
+    wants_states = section.values.get("csm_states", False)
+    if not isinstance(wants_states, bool):
+        raise InputError(f"{section.where}csm_states is {wants_states!r}; expected true or false")
+    local = [
+        scanner_image.id
+        for scanner_image in images
+        if isinstance(scanner_image, ScannerImage) and scanner_image.earth is None
+    ]
+    if wants_states and local:
         raise InputError(
             f"{section.where}csm_states: image {local[0]!r} is in a local frame, which model "
             "states do not have; omit it"
         )
-    return wanted
+    return wants_states
 
 
 def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> HeightModel | None:
@@ -218,10 +228,12 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
     if sigma <= 0:
         raise InputError(f"{section.where}dem_sigma is {sigma:g}; expected metres above 0")
     extents = [
-        image_extent(one.image, one.earth) if isinstance(one, ScannerImage) else
-        rpc_extent(one.image.rpc)
-        for one in images if one.earth is not None
-    ]  # fmt: skip
+        image_extent(scanner_image.image, scanner_image.earth)
+        if isinstance(scanner_image, ScannerImage)
+        else rpc_extent(scanner_image.image.rpc)
+        for scanner_image in images
+        if scanner_image.earth is not None
+    ]
     terrain = read_terrain(path, earth, joint_extent(extents), above_geoid="geoid" in section)
     if "geoid" in section:
         # A file beside this one, or the name of a grid of PROJ.

@@ -47,12 +47,12 @@ def read_points(
     files = [] if ties_alone else section.paths("observations", "a CSV table, .match, .gcp or .pvl")
     by_suffix = {s: [f for f in files if f.suffix.lower() == s] for s in (GCP, MATCH)}
     of_isis = [f for f in files if f.suffix.lower() in ISIS or is_jigsaw_residuals(f)]
-    others = (*by_suffix[GCP], *by_suffix[MATCH], *of_isis)
-    tables = [read_csv(f) for f in files if f not in others]
+    other_files = (*by_suffix[GCP], *by_suffix[MATCH], *of_isis)
+    tables = [read_csv(f) for f in files if f not in other_files]
     for table in tables:
         table.check_names(MEASURED[:4], MEASURED[4:])
     parts, warnings = [], []
-    if "points" in section or not (len(others) or ties_alone):
+    if "points" in section or not (len(other_files) or ties_alone):
         parts.append(_points_of(section.table("points"), images[0].earth, radians))
     for path in by_suffix[GCP]:
         control = read_gcp(path)
@@ -62,32 +62,32 @@ def read_points(
         if unknown:
             warnings.append(f"{path}: measurements in images that are not in [images]: {unknown}")
     if by_suffix[MATCH]:
-        table, ties, said = _matched(by_suffix[MATCH], names, [one.id for one in images])
+        table, ties, match_warnings = _matched(by_suffix[MATCH], names, [one.id for one in images])
         tables.append(table)
         parts.append(ties)
-        warnings += said
+        warnings += match_warnings
     for path in of_isis:
-        given = {id for part in parts for id in part.id}
+        given_ids = {id for part in parts for id in part.id}
         network = path.suffix.lower() in ISIS
-        found = read_control_network(path) if network else read_jigsaw_residuals(path)
-        warnings += found.messages
-        table, unknown = _measured_by_isis(found, path, names)
+        isis_points = read_control_network(path) if network else read_jigsaw_residuals(path)
+        warnings += isis_points.messages
+        table, unknown = _measured_by_isis(isis_points, path, names)
         tables.append(table)
-        parts.append(_points_of_isis(found, path, given))
+        parts.append(_points_of_isis(isis_points, path, given_ids))
         if unknown:
             warnings.append(
                 f"{path}: measurements in images that are not in [images]: {list_some(unknown, 3)}"
                 "; of serial numbers give [serial_numbers]"
             )
     if "tie_points" in section:
-        given = {id for part in parts for id in part.id}
+        given_ids = {id for part in parts for id in part.id}
         measured: set[tuple[object, ...]] = set()
         for path in section.paths("tie_points", "a CSV table of measurements of tie points"):
             table = read_csv(path)
             table.check_names(MEASURED[:4], MEASURED[4:])
             tables.append(_without_repeated(table, measured))
-            new = [id for id in dict.fromkeys(table.values["point"]) if id not in given]
-            given |= set(new)
+            new = [id for id in dict.fromkeys(table.values["point"]) if id not in given_ids]
+            given_ids |= set(new)
             parts.append(_tie_points(new, Source(str(path))))
     points = _join_points(parts)
     # Checked first: the ids of observations are looked up in it.
@@ -95,23 +95,24 @@ def read_points(
     ids = {id: k for k, id in enumerate(points.id)}
     if frames is not None:
         # Points that only photographs show follow those of the table.
-        more = (id for id in frames.points.id if id not in ids)
-        ids |= {id: k for k, id in enumerate(more, len(ids))}
-    known = [image.id for image in images]
+        frame_ids = (id for id in frames.points.id if id not in ids)
+        ids |= {id: k for k, id in enumerate(frame_ids, len(ids))}
+    image_ids = [image.id for image in images]
     table = _join_tables(tables)
-    return points, _observations(table, ids, known, section, points.source.name), warnings
+    return points, _observations(table, ids, image_ids, section, points.source.name), warnings
 
 
-def _without_repeated(table: Columns, known: set[tuple[object, ...]]) -> Columns:
-    """A table of tie points without the measurements that an earlier one has, `known`: a corner of
-    an image is the same measurement in the tables of all its pairs. These are added to `known`."""
+def _without_repeated(table: Columns, known_rows: set[tuple[object, ...]]) -> Columns:
+    """A table of tie points without the measurements that an earlier one has, `known_rows`: a
+    corner of an image is the same measurement in the tables of all its pairs. These are added to
+    `known_rows`."""
     rows = list(zip(*(table.values[name] for name in MEASURED[:4])))
-    kept = np.array([k for k, row in enumerate(rows) if row not in known], int)
-    known |= set(rows)
-    if len(kept) == len(rows):
+    new_rows = np.array([k for k, row in enumerate(rows) if row not in known_rows], int)
+    known_rows |= set(rows)
+    if len(new_rows) == len(rows):
         return table
-    values = {name: [column[k] for k in kept] for name, column in table.values.items()}
-    return Columns(values, table.source.take(kept))
+    values = {name: [column[k] for k in new_rows] for name, column in table.values.items()}
+    return Columns(values, table.source.take(new_rows))
 
 
 def _control_points(control: ControlFile, path: Path, earth: Ellipsoid | None) -> GroundPoints:
@@ -142,54 +143,61 @@ def _measured_control(
     """The measurements of a `.gcp` file as a table, and its images that nobody knows, in words."""
     images = [names.get(name) or names.get(Path(name).stem) for name in control.image]
     unknown = {name for name, id in zip(control.image, images) if id is None}
-    kept = np.array([k for k, id in enumerate(images) if id is not None], int)
-    point = control.point[kept]
+    known_rows = np.array([k for k, id in enumerate(images) if id is not None], int)
+    point = control.point[known_rows]
     values = {
-        "image": [images[k] for k in kept],
+        "image": [images[k] for k in known_rows],
         "point": [control.id[p] for p in point],
-        **dict(zip(("line", "pixel"), control.xy[kept].T.tolist())),
-        **dict(zip(("sline", "spixel"), control.xy_sigma[kept].T.tolist())),
+        **dict(zip(("line", "pixel"), control.xy[known_rows].T.tolist())),
+        **dict(zip(("sline", "spixel"), control.xy_sigma[known_rows].T.tolist())),
     }
     return Columns(values, Source(str(path), control.row[point], "line")), ", ".join(
         sorted(unknown)
     )
 
 
-def _points_of_isis(found: IsisPoints, path: Path, given: set[str]) -> GroundPoints:
+def _points_of_isis(isis_points: IsisPoints, path: Path, given_ids: set[str]) -> GroundPoints:
     """The points of a file of ISIS that are not given otherwise: σ along the axes of each one's
     covariance."""
-    kept = np.array([k for k, id in enumerate(found.id) if id not in given], int)
-    variances, vectors = np.linalg.eigh(found.covariance[kept])
-    X = found.X[kept].copy()
-    roles = [found.role[k] for k in kept]
+    new_rows = np.array([k for k, id in enumerate(isis_points.id) if id not in given_ids], int)
+    variances, vectors = np.linalg.eigh(isis_points.covariance[new_rows])
+    X = isis_points.X[new_rows].copy()
+    roles = [isis_points.role[k] for k in new_rows]
     # Tie points begin at the intersection of their rays.
     X[np.array(roles, object) == "tie"] = np.nan
     return GroundPoints(
-        tuple(found.id[k] for k in kept),
+        tuple(isis_points.id[k] for k in new_rows),
         tuple(roles),
         X,
         np.sqrt(np.maximum(variances, 0.0)),
         np.swapaxes(vectors, 1, 2),
         ("first axis", "second axis", "third axis"),
-        Source(str(path), found.row[kept], "line"),
+        Source(str(path), isis_points.row[new_rows], "line"),
     )
 
 
 def _measured_by_isis(
-    found: IsisPoints, path: Path, names: Mapping[str, str]
+    isis_points: IsisPoints, path: Path, names: Mapping[str, str]
 ) -> tuple[Columns, list[str]]:
     """The measurements of a file of ISIS as a table, and its images that nobody knows."""
-    images = [next((names[n] for n in known if n in names), None) for known in found.image]
-    unknown = sorted({known[0] for known, id in zip(found.image, images) if id is None})
-    kept = np.array([k for k, id in enumerate(images) if id is not None], int)
-    sigma = [[None if np.isnan(v) else v for v in found.xy_sigma[kept, k].tolist()] for k in (0, 1)]
+    images = [
+        next((names[n] for n in serials if n in names), None) for serials in isis_points.image
+    ]
+    unknown = sorted({serials[0] for serials, id in zip(isis_points.image, images) if id is None})
+    known_rows = np.array([k for k, id in enumerate(images) if id is not None], int)
+    sigma = [
+        [None if np.isnan(v) else v for v in isis_points.xy_sigma[known_rows, k].tolist()]
+        for k in (0, 1)
+    ]
     values = {
-        "image": [images[k] for k in kept],
-        "point": [found.id[p] for p in found.point[kept]],
-        **dict(zip(("line", "pixel"), found.xy[kept].T.tolist())),
+        "image": [images[k] for k in known_rows],
+        "point": [isis_points.id[p] for p in isis_points.point[known_rows]],
+        **dict(zip(("line", "pixel"), isis_points.xy[known_rows].T.tolist())),
         **dict(zip(("sline", "spixel"), sigma)),
     }
-    table = Columns(values, Source(str(path), found.ray_row[kept], "line"), may_be_empty=True)
+    table = Columns(
+        values, Source(str(path), isis_points.ray_row[known_rows], "line"), may_be_empty=True
+    )
     return table, unknown
 
 
@@ -197,24 +205,27 @@ def _matched(
     files: Sequence[Path], names: Mapping[str, str], ids: Sequence[str]
 ) -> tuple[Columns, GroundPoints, list[str]]:
     """The tie points of `.match` files: their measurements, themselves, and warnings."""
-    pairs, at = [], {id: k for k, id in enumerate(ids)}
+    pairs, index_of = [], {id: k for k, id in enumerate(ids)}
     for path in files:
-        first, second = (at[names[name]] for name in images_of_match(path, list(names)))
-        pairs.append((first, second, *read_match(path)))
-    found = join_matches(pairs)
-    number = int(found.point.max(initial=-1)) + 1
+        first_image, second_image = (
+            index_of[names[name]] for name in images_of_match(path, list(names))
+        )
+        pairs.append((first_image, second_image, *read_match(path)))
+    joined_matches = join_matches(pairs)
+    number = int(joined_matches.point.max(initial=-1)) + 1
     labels = [f"M{k + 1}" for k in range(number)]
     values = {
-        "image": [ids[i] for i in found.image],
-        "point": [labels[p] for p in found.point],
-        **dict(zip(("line", "pixel"), found.xy.T.tolist())),
+        "image": [ids[i] for i in joined_matches.image],
+        "point": [labels[p] for p in joined_matches.point],
+        **dict(zip(("line", "pixel"), joined_matches.xy.T.tolist())),
     }
     source = Source("match files")
     ties = _tie_points(labels, source)
     warnings = []
-    if found.contradicting:
+    if joined_matches.contradicting:
         warnings.append(
-            f"match files: {count(found.contradicting, 'tie point')} with two places in one image, "
+            f"match files: {count(joined_matches.contradicting, 'tie point')} with two places in "
+            "one image, "
             "left out"
         )
     return Columns(values, source), ties, warnings
@@ -239,13 +250,13 @@ def _join_points(parts: Sequence[GroundPoints]) -> GroundPoints:
             f"{files}: σ of control points are along X, Y, Z in one and along east, north, up in "
             "another; give all along the same axes"
         )
-    joined = lambda name: np.concatenate([getattr(part, name) for part in parts])
+    join = lambda name: np.concatenate([getattr(part, name) for part in parts])
     return GroundPoints(
         tuple(id for part in parts for id in part.id),
         tuple(role for part in parts for role in part.role),
-        joined("X"),
-        joined("sigma"),
-        joined("axes"),
+        join("X"),
+        join("sigma"),
+        join("axes"),
         axes.pop() if axes else parts[0].axis_names,
         _join_sources([(part.source, len(part)) for part in parts], "points"),
     )
@@ -303,9 +314,9 @@ def _points_of(table: Columns, earth: Ellipsoid | None, radians: float) -> Groun
             ],
             1,
         )
-        known = np.isfinite(X).all(1)
+        is_known = np.isfinite(X).all(1)
         # An unknown place has no east and north: its σ are of the axes.
-        axes[known] = east_north_up(earth, X[known])
+        axes[is_known] = east_north_up(earth, X[is_known])
     return GroundPoints(
         table.ids("id"),
         table.ids("role"),
@@ -325,12 +336,12 @@ def _observations(
     where_points: str,
 ) -> Observations:
     table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
-    sigma, stated = section.number("sigma", 1.0), "sigma" in section.values
+    sigma, is_stated = section.number("sigma", 1.0), "sigma" in section.values
     if sigma <= 0:
         raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
     stated_sigma = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
     lacking = np.isnan(stated_sigma)
-    if not stated and lacking.any() and not lacking.all():
+    if not is_stated and lacking.any() and not lacking.all():
         row = int(lacking.any(1).argmax())
         raise InputError(
             f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
@@ -342,5 +353,5 @@ def _observations(
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
         np.where(lacking, sigma, stated_sigma),
         table.source,
-        STATED if stated or not lacking.any() else UNIT,
+        STATED if is_stated or not lacking.any() else UNIT,
     )

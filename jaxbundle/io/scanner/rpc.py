@@ -123,8 +123,8 @@ def read_rpc(path: str | Path, unknown: UnknownKeys | None = None) -> Rpc:
         elif "line_num_coeff_00" in text or path.suffix.lower() == ".geom":
             values = from_geom(path, text)
         else:
-            read = _from_rpb if "lineOffset" in text else _from_text
-            values = read(path, text, unknown)
+            read_values = _from_rpb if "lineOffset" in text else _from_text
+            values = read_values(path, text, unknown)
     for axis in OFFSETS:
         if values[f"{axis}_scale"] == 0:
             raise InputError(f"{path}: the scale of {axis} is 0; expected another number")
@@ -145,14 +145,16 @@ def read_stated_errors(path: str | Path) -> StatedErrors:
     if path.suffix.lower() in RASTERS:
         with open_raster(path) as source, foreign_parser(f"{path}: its RPC", "those of a raster"):
             tags = source.rpcs
-        said = {name: getattr(tags, f"err_{name[:4]}", None) for name in ERRORS}
+        stated_words = {name: getattr(tags, f"err_{name[:4]}", None) for name in ERRORS}
     else:
         text = read_text(path, fallback="latin-1")
-        found = {name: pattern.search(text) for name, pattern in ERRORS.items()}
-        said = {name: match and match[1] for name, match in found.items()}
+        matches = {name: pattern.search(text) for name, pattern in ERRORS.items()}
+        stated_words = {name: match and match[1] for name, match in matches.items()}
     # A negative number stands for an unknown one in RPC00B.
     number = lambda word: max(number_in(str(word), f"{path}: its stated error"), 0.0)
-    return StatedErrors(**{name: number(word) for name, word in said.items() if word is not None})
+    return StatedErrors(
+        **{name: number(word) for name, word in stated_words.items() if word is not None}
+    )
 
 
 def write_rpc(path: str | Path, rpc: Rpc) -> None:
@@ -181,13 +183,13 @@ def _from_text(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
                 f"{path}, line {number}: {show(line.strip())}; expected NAME: value, such as "
                 "LINE_OFF: 3000.5"
             )
-        written, name = name.strip(), name.strip().upper()
+        key_as_written, name = name.strip(), name.strip().upper()
         if name in entries:
             raise InputError(f"{path}, line {number}: {name} occurs twice")
         entries[name] = value.split(), number
         # As it is written: capitals show where the words of an unknown name begin.
         if TEXT_KEYS.unknown((name,)):
-            unknown.check((written,), TEXT_KEYS, f"{path}, line {number}")
+            unknown.check((key_as_written,), TEXT_KEYS, f"{path}, line {number}")
 
     def number_of(name: str, unit: str | None = None) -> float:
         if name not in entries:
@@ -270,12 +272,12 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
     package = rasterio()
     from rasterio.rpc import RPC
 
-    given = {}
+    tags = {}
     for axis, (_, key) in OFFSETS.items():
-        given[f"{key}_off"] = float(getattr(rpc, f"{axis}_offset"))
-        given[f"{key}_scale"] = float(getattr(rpc, f"{axis}_scale"))
+        tags[f"{key}_off"] = float(getattr(rpc, f"{axis}_offset"))
+        tags[f"{key}_scale"] = float(getattr(rpc, f"{axis}_scale"))
     for field, (name, _) in FIELDS.items():
-        given[name.lower()] = np.asarray(getattr(rpc, field)).tolist()
+        tags[name.lower()] = np.asarray(getattr(rpc, field)).tolist()
     if not path.is_file():
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
@@ -283,7 +285,7 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
             # The tags of the copy change: after a failure the raster is as it was.
             shutil.copyfile(path, temporary)
             with open_plain(temporary, "r+") as target:
-                target.rpcs = RPC(**given)
+                target.rpcs = RPC(**tags)
             with package.open(temporary) as target:  # errors at closing are not reported
                 if target.rpcs is None:
                     raise InputError(f"{path}: cannot be written: no tags arrived{disk_of(path)}")

@@ -62,27 +62,35 @@ def check_against_rpc(
         return scanner
     if not np.isfinite(usual.rms):
         return _warn(scanner, f"{path}: no position could be compared with the RPC of {file.name}")
-    found = _compare(image, rpc, CORRECTION_SETS)
-    best = min(range(len(found)), key=lambda k: np.nan_to_num(found[k].rms, nan=np.inf))
-    chosen = CORRECTION_SETS[best]
-    if _agree(found[best], random_error):
+    agreements = _compare(image, rpc, CORRECTION_SETS)
+    best = min(range(len(agreements)), key=lambda k: np.nan_to_num(agreements[k].rms, nan=np.inf))
+    chosen_corrections = CORRECTION_SETS[best]
+    if _agree(agreements[best], random_error):
         if choose:
             message = (
-                f"{path}: {_names(chosen)} applied, with which the rigorous model agrees with the "
-                f"RPC of {file.name} ({_size(found[best])}); with those usual for this product, "
+                f"{path}: {_names(chosen_corrections)} applied, with which the rigorous model "
+                "agrees with the "
+                f"RPC of {file.name} ({_size(agreements[best])}); with those usual for this "
+                "product, "
                 f"{_names(image.corrections)}, it does not ({_size(usual)}). [corrections] in a "
                 "scanner file sets others"
             )
-            image = dataclasses.replace(image, corrections=chosen)
-            chosen_one = dataclasses.replace(scanner, image=image, agreement=found[best])
+            image = dataclasses.replace(image, corrections=chosen_corrections)
+            chosen_one = dataclasses.replace(scanner, image=image, agreement=agreements[best])
             return _warn(chosen_one, message)
-        remedy = f"With {_names(chosen)} they agree ({_size(found[best])}): set [corrections] so"
-    else:
-        others = "; others leave more"
-        if chosen != image.corrections:
-            others = f"; the smallest difference, with {_names(chosen)}, is {_size(found[best])}"
         remedy = (
-            f"No corrections explain it{others}. Check the origin of lines and pixels and whether "
+            f"With {_names(chosen_corrections)} they agree ({_size(agreements[best])}): set "
+            "[corrections] so"
+        )
+    else:
+        remark = "; others leave more"
+        if chosen_corrections != image.corrections:
+            remark = (
+                f"; the smallest difference, with {_names(chosen_corrections)}, is "
+                f"{_size(agreements[best])}"
+            )
+        remedy = (
+            f"No corrections explain it{remark}. Check the origin of lines and pixels and whether "
             "the RPC are of this image, or use the RPC"
         )
     return _warn(
@@ -120,20 +128,23 @@ def _compare(image: PushbroomImage, rpc: Rpc, sets: tuple[Corrections, ...]) -> 
         return compare_with_rpc(image, rpc, sets)
 
 
-def _agree(found: Agreement, random_error: float) -> bool:
+def _agree(agreement: Agreement, random_error: float) -> bool:
     # The random error is per axis, the RMS of the length of both.
-    return found.rms_pixels <= SUBPIXEL or found.rms <= np.sqrt(2) * random_error
+    return agreement.rms_pixels <= SUBPIXEL or agreement.rms <= np.sqrt(2) * random_error
 
 
-def _size(found: Agreement) -> str:
-    return f"{found.rms:.2g} m RMS, {found.rms_pixels:.2g} pixel; {found.largest:.2g} m at most"
+def _size(agreement: Agreement) -> str:
+    return (
+        f"{agreement.rms:.2g} m RMS, {agreement.rms_pixels:.2g} pixel; {agreement.largest:.2g} m "
+        "at most"
+    )
 
 
 def _names(corrections: Corrections) -> str:
-    on = [name.replace("_", " ") for name, is_on in corrections._asdict().items() if is_on]
-    if not on:
+    names_on = [name.replace("_", " ") for name, is_on in corrections._asdict().items() if is_on]
+    if not names_on:
         return "no correction"
-    return on[0] if len(on) == 1 else f"{', '.join(on[:-1])} and {on[-1]}"
+    return names_on[0] if len(names_on) == 1 else f"{', '.join(names_on[:-1])} and {names_on[-1]}"
 
 
 def _warn(scanner: ScannerInput, message: str) -> ScannerInput:

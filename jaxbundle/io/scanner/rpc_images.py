@@ -68,8 +68,8 @@ def read_rpc_image(path: Path, raster: Path | None = None) -> RpcInput:
         if source != beside and bands.crs is None:
             check_raw(beside, bands)
         size = bands.height, bands.width
-    said = () if source == beside else _other_size(source, beside, rpc, size)
-    return RpcInput(path.stem, RpcImage(rpc, *size), warnings=(*unknown.messages(), *said))
+    messages = () if source == beside else _other_size(source, beside, rpc, size)
+    return RpcInput(path.stem, RpcImage(rpc, *size), warnings=(*unknown.messages(), *messages))
 
 
 def find_coefficients(path: Path) -> Path:
@@ -83,10 +83,10 @@ def find_coefficients(path: Path) -> Path:
     if path.suffix.lower() not in IMAGES:
         return path
     beside = (path.with_name(path.stem + end) for end in COMPANION_ENDINGS)
-    found = next((p for p in beside if p.is_file()), path)
-    if found is path and path.suffix.lower() not in RASTERS:
+    coefficients_file = next((p for p in beside if p.is_file()), path)
+    if coefficients_file is path and path.suffix.lower() not in RASTERS:
         raise InputError(f"{path}: no coefficients beside it: expected {path.stem}_RPC.TXT")
-    return found
+    return coefficients_file
 
 
 def find_raster(path: Path, *folders: Path) -> Path | None:
@@ -104,12 +104,13 @@ def find_raster(path: Path, *folders: Path) -> Path | None:
 
 def _other_size(source: Path, raster: Path, rpc: Rpc, size: tuple[int, int]) -> tuple[str, ...]:
     """Whether coefficients may belong to another raster, such as the whole image of a tile."""
-    held = _domain_size(rpc)
+    domain_size = _domain_size(rpc)
     # Vendors' domains end within a tenth of the image; a tile is half of it or less.
-    if all(abs(a - b) <= 0.25 * b for a, b in zip(held, size)):
+    if all(abs(a - b) <= 0.25 * b for a, b in zip(domain_size, size)):
         return ()
     return (
-        f"{source} holds for {held[0]} lines of {held[1]} pixels, {raster} has {size[0]} of "
+        f"{source} holds for {domain_size[0]} lines of {domain_size[1]} pixels, {raster} has "
+        f"{size[0]} of "
         f"{size[1]}: is it a tile or a part of a larger image? Coefficients refer to the whole",
     )
 

@@ -119,13 +119,16 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
 
     **Raises:** `InputError` naming file, line and keyword.
     """
-    found = {}
+    keywords = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, value = line.partition(":")
         if colon:
             # Keywords may be prefixed by the image or the projection.
-            found[name.strip()] = found[name.strip().rpartition(".")[2]] = value.strip(), number
-    kind, line = found.get("polynomial_format", ("B", 0))
+            keywords[name.strip()] = keywords[name.strip().rpartition(".")[2]] = (
+                value.strip(),
+                number,
+            )
+    kind, line = keywords.get("polynomial_format", ("B", 0))
     if kind != "B":
         raise InputError(
             f"{path}, line {line}: polynomial_format is {show(kind)}; only B is read, whose terms "
@@ -133,32 +136,33 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
         )
     adjusted = [
         name
-        for name, (value, _) in found.items()
+        for name, (value, _) in keywords.items()
         if ".adj_param_" in name
         and name.endswith(".parameter")
         and value not in ("0", "0.0")
-        and number_of(path, found, name) != 0
+        and number_of(path, keywords, name) != 0
     ]
     if adjusted:
         raise InputError(
-            f"{path}, line {found[adjusted[0]][1]}: the adjustable parameter {adjusted[0]} is not "
+            f"{path}, line {keywords[adjusted[0]][1]}: the adjustable parameter {adjusted[0]} is "
+            "not "
             "0; adjusted models are not read"
         )
     values: dict[str, Any] = {}
     for axis, name in AXES.items():
-        values[f"{axis}_offset"] = number_of(path, found, f"{name}_off")
-        values[f"{axis}_scale"] = number_of(path, found, f"{name}_scale")
+        values[f"{axis}_offset"] = number_of(path, keywords, f"{name}_off")
+        values[f"{axis}_scale"] = number_of(path, keywords, f"{name}_scale")
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k:02d}" for k in range(TERMS)]
-        values[field] = [number_of(path, found, name) for name in names]
+        values[field] = [number_of(path, keywords, name) for name in names]
     return values
 
 
-def number_of(path: Path, found: dict[str, tuple[str, int]], name: str) -> float:
+def number_of(path: Path, keywords: dict[str, tuple[str, int]], name: str) -> float:
     """The number of a keyword."""
-    if name not in found:
+    if name not in keywords:
         raise InputError(f"{path}: {name} is missing; expected a keyword list of an OSSIM RPC")
-    value, line = found[name]
+    value, line = keywords[name]
     return number_in(value, f"{path}, line {line}: {name}")
 
 
@@ -190,9 +194,9 @@ def _from_early_dimap(file: XmlFields) -> dict[str, Any]:
         values[f"{axis}_offset"] = file.number(f"{EARLY}/RFM_Validity/{name}/B")
     for axis, name in (("line", "ROW"), ("sample", "COL")):
         values[f"{axis}_offset"] -= 1.0
-        both = file.numbers(f"{EARLY}/Inverse_Model/F_{name}", 2 * TERMS).tolist()
-        values[f"{axis}_numerator"] = both[:TERMS]
-        values[f"{axis}_denominator"] = both[TERMS:]
+        coefficients = file.numbers(f"{EARLY}/Inverse_Model/F_{name}", 2 * TERMS).tolist()
+        values[f"{axis}_numerator"] = coefficients[:TERMS]
+        values[f"{axis}_denominator"] = coefficients[TERMS:]
     return values
 
 

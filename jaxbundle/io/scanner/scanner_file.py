@@ -216,10 +216,12 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
 
 
-def _frame(section: TomlSection, earth: Ellipsoid | None, known: Sequence[str]) -> str:
+def _frame(section: TomlSection, earth: Ellipsoid | None, known_frames: Sequence[str]) -> str:
     frame = section.text("frame", "local" if earth is None else "ITRF")
-    if frame not in known:
-        raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
+    if frame not in known_frames:
+        raise InputError(
+            f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known_frames)}"
+        )
     # Attitudes against the orbit are given without an Earth, too.
     if (earth is None) != (frame == "local") and frame != "orbit":
         raise InputError(
@@ -257,12 +259,13 @@ def _check_outside(P: Float[np.ndarray, "n 3"], earth: Ellipsoid, source: Source
     """Refuse positions deep inside the Earth, such as in kilometres."""
     distance = np.linalg.norm(P, axis=1)
     # A hundredth of the axis, 64 km: no camera is so deep.
-    least = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
-    if (bad := distance < least).any():
+    smallest_distance = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
+    if (bad := distance < smallest_distance).any():
         row = int(bad.argmax())
         raise InputError(
             f"{source(row)}: the position is {distance[row]:.6g} m from the centre of the Earth, "
-            f"whose axes are {least / 0.99:.7g} m and more; expected metres from the centre: is it "
+            f"whose axes are {smallest_distance / 0.99:.7g} m and more; expected metres from the "
+            "centre: is it "
             "in kilometres, or in another frame?"
         )
 
@@ -273,19 +276,19 @@ def _orbit(
     """Two-line elements, a circle, a state: as a table for interpolation."""
     start, end = section.numbers("span", 2)
     step = section.number("step", 1.0)
-    most = 1_000_000  # 50 MB of states: more is a mistake in the span or the step
-    if not (step > 0 and 0 < (end - start) / step <= most):
+    max_steps = 1_000_000  # 50 MB of states: more is a mistake in the span or the step
+    if not (step > 0 and 0 < (end - start) / step <= max_steps):
         raise InputError(
             f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; expected 1 "
-            f"to {most} steps forward"
+            f"to {max_steps} steps forward"
         )
     t = np.arange(start, end, step)
     if kind == "tle":
         lines = section.values["tle"]
         if not (isinstance(lines, list) and len(lines) == 2):
             raise InputError(f"{section.where}tle: expected a list of the two lines")
-        first, second = lines
-        P, V = frames.two_line_orbit(first, second, _epoch(file), t, _orientation(file))
+        first_line, second_line = lines
+        P, V = frames.two_line_orbit(first_line, second_line, _epoch(file), t, _orientation(file))
     elif kind == "state":
         frame = _frame(section, earth, frames.FRAMES)
         time = section.number("at", 0.0)
@@ -356,12 +359,12 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
         return AngleTable(*(jnp.asarray(a) for a in angles))
     if "across" in section:
         section.check_keys(("across", "along", "middle", "half"))
-        half = section.number("half", pixels / 2)
+        half_width = section.number("half", pixels / 2)
         return AnglePolynomial(
             jnp.asarray(section.numbers("across")),
             jnp.asarray(section.numbers("along")),
             jnp.asarray(middle),
-            jnp.asarray(half),
+            jnp.asarray(half_width),
         )
     try:
         model = get_model(section.text("model", "brown"))

@@ -31,11 +31,11 @@ def sight_frame(
     """
     look = np.array([*sights[:, sights.shape[1] // 2], 1.0])
     # The camera frame here looks along −z: rotated about x, or unchanged and seen from behind.
-    ahead = look @ down > 0
-    turn = Rotation.from_matrix(np.diag([1.0, -1, -1]) if ahead else np.eye(3))
-    signs = np.array([1.0, -1.0]) if ahead else np.array([-1.0, -1.0])
-    along = signs * (sights[:, -1] - sights[:, 0])
-    angle = np.arctan2(along[1], along[0])
+    is_ahead = look @ down > 0
+    turn = Rotation.from_matrix(np.diag([1.0, -1, -1]) if is_ahead else np.eye(3))
+    signs = np.array([1.0, -1.0]) if is_ahead else np.array([-1.0, -1.0])
+    line_direction = signs * (sights[:, -1] - sights[:, 0])
+    angle = np.arctan2(line_direction[1], line_direction[0])
     about = lambda angle: turn * Rotation.from_rotvec([0, 0, angle])
     if about(angle).inv().apply(forward)[1] < 0:  # y would point backwards
         angle += np.pi
@@ -48,7 +48,7 @@ def polynomial_optics(
     frame: SightFrame, x: Float[np.ndarray, " k"], y: Float[np.ndarray, " k"]
 ) -> AnglePolynomial:
     """The optics of x/z and y/z that are polynomials of the pixel, constants first."""
-    across, along = frame.slopes(np.asarray(x, float), np.asarray(y, float))
+    slope_across, slope_along = frame.slopes(np.asarray(x, float), np.asarray(y, float))
     return AnglePolynomial(
-        jnp.asarray(across), jnp.asarray(along), jnp.asarray(0.0), jnp.asarray(1.0)
+        jnp.asarray(slope_across), jnp.asarray(slope_along), jnp.asarray(0.0), jnp.asarray(1.0)
     )

@@ -165,7 +165,7 @@ def read_worldview(file: XmlFields) -> ScannerInput:
     down, forward = tables.directions(float(times.time((lines - 1) / 2)))
     frame = sight_frame(np.stack([np.polyval(p[::-1], u) for p in (x, y)]), down, forward)
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
-    trajectory, told = trajectory_of(tables, frame.turn, when)
+    trajectory, messages = trajectory_of(tables, frame.turn, when)
     image = make_image(
         trajectory,
         times,
@@ -176,7 +176,9 @@ def read_worldview(file: XmlFields) -> ScannerInput:
         sources=(tables.positions, tables.attitude),
     )
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
-    return ScannerInput(name, image, WGS84, (*lengths, *odd, *warnings, *told, *unknown.messages()))
+    return ScannerInput(
+        name, image, WGS84, (*lengths, *odd, *warnings, *messages, *unknown.messages())
+    )
 
 
 def _line_times(file: XmlFields, lines: int) -> LineTimes:
@@ -187,12 +189,12 @@ def _line_times(file: XmlFields, lines: int) -> LineTimes:
         rate = file.number("IMD/IMAGE/AVGLINERATE")
         if file.text("IMD/IMAGE/SCANDIRECTION", "Forward").lower() != "forward":
             rate = -rate
-        first, t, slope = pairs[0, 0], pairs[0, 1], np.array([1 / rate if rate else np.inf])
+        first_lines, t, slope = pairs[0, 0], pairs[0, 1], np.array([1 / rate if rate else np.inf])
     else:
-        first, t = pairs[:, 0], pairs[:, 1]
-        if (np.diff(first) <= 0).any():
+        first_lines, t = pairs[:, 0], pairs[:, 1]
+        if (np.diff(first_lines) <= 0).any():
             raise InputError(f"{file.path}: the lines of TLCLIST do not increase")
-        slope = np.diff(t) / np.diff(first)
+        slope = np.diff(t) / np.diff(first_lines)
     if not ((slope > 0) & np.isfinite(slope)).all():
         raise InputError(
             f"{file.path}: the times of TLCLIST, AVGLINERATE, SCANDIRECTION go backwards; the "
@@ -200,19 +202,23 @@ def _line_times(file: XmlFields, lines: int) -> LineTimes:
         )
     # 1e-9 of the period, as the file rounds its times: one rate, which needs no table
     if np.ptp(slope) <= 1e-9 * slope[0]:
-        start = np.ravel(t)[0] - slope[0] * np.ravel(first)[0]
+        start = np.ravel(t)[0] - slope[0] * np.ravel(first_lines)[0]
         return LineTimes(jnp.asarray(start), jnp.asarray(slope[0]))
     l = np.arange(lines)
-    k = np.clip(np.searchsorted(first, l, side="right") - 1, 0, len(slope) - 1)
-    return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t[k] + slope[k] * (l - first[k])))
+    k = np.clip(np.searchsorted(first_lines, l, side="right") - 1, 0, len(slope) - 1)
+    return LineTimes(
+        jnp.zeros(()), jnp.zeros(()), jnp.asarray(t[k] + slope[k] * (l - first_lines[k]))
+    )
 
 
 def _table(
-    file: XmlFields, group: str, name: str, used: int, epoch: np.datetime64
+    file: XmlFields, group: str, name: str, number_used: int, epoch: np.datetime64
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows n"], Source]:
     """Seconds since the epoch, the values of the rows, and the source of the table."""
     rows = file.elements(f"{group}/{name}List/{name}")
-    values = np.array([_numbers(file, e, f"{name} {k}", used) for k, e in enumerate(rows, 1)])
+    values = np.array(
+        [_numbers(file, e, f"{name} {k}", number_used) for k, e in enumerate(rows, 1)]
+    )
     start = seconds(file.time(f"{group}/STARTTIME"), epoch)
     t = start + file.number(f"{group}/TIMEINTERVAL") * (values[:, 0] - 1)
     source = Source(f"{file.path}, {name}", None, "row")
@@ -222,12 +228,12 @@ def _table(
     return t, values[:, 1:], source
 
 
-def _numbers(file: XmlFields, element: ET.Element, name: str, used: int) -> list[float]:
+def _numbers(file: XmlFields, element: ET.Element, name: str, number_used: int) -> list[float]:
     """The first numbers of an element with more numbers."""
     words = (element.text or "").replace(",", " ").split()
-    if len(words) < used:
-        raise InputError(f"{file.path}: {name} has {len(words)} numbers; expected {used}")
-    return [number_in(word, f"{file.path}: {name}") for word in words[:used]]
+    if len(words) < number_used:
+        raise InputError(f"{file.path}: {name} has {len(words)} numbers; expected {number_used}")
+    return [number_in(word, f"{file.path}: {name}") for word in words[:number_used]]
 
 
 def _detectors(
@@ -236,8 +242,8 @@ def _detectors(
     """x/c and y/c as polynomials of the pixel, and a warning if bands differ."""
     for name in ("ALIST", "BLIST"):
         # Early files have the coefficients without a list around them.
-        found = file.root.findall(f".//GEO/OPTICAL_DISTORTION//{name}")
-        text = " ".join(word for e in found for word in e.itertext()).replace(",", " ")
+        elements = file.root.findall(f".//GEO/OPTICAL_DISTORTION//{name}")
+        text = " ".join(word for e in elements for word in e.itertext()).replace(",", " ")
         if any(number_in(word, f"{file.path}: {name}") != 0 for word in text.split()):
             raise InputError(f"{file.path}: OPTICAL_DISTORTION ({name}) is not supported; use RPC")
     mounting = file.find("GEO/DETECTOR_MOUNTING")
@@ -256,12 +262,13 @@ def _detectors(
     c = file.number("GEO/PRINCIPAL_DISTANCE/PD")
     if c == 0 or pitch == 0:
         raise InputError(f"{file.path}: PD and DETPITCH must not be 0, in millimetres")
-    other = [band.tag for band, v in zip(bands, values) if v != values[0]]
+    differing_bands = [band.tag for band, v in zip(bands, values) if v != values[0]]
     warnings = (
         ()
-        if not other
+        if not differing_bands
         else (
-            f"{file.path}: the detectors of {', '.join(other)} differ in position from those of "
+            f"{file.path}: the detectors of {', '.join(differing_bands)} differ in position from "
+            "those of "
             f"{bands[0].tag}, which are used",
         )
     )

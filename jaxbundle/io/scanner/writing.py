@@ -102,8 +102,8 @@ def _optics(
 ) -> dict[str, Any]:
     if isinstance(optics, FocalLine):
         parameters = dict(zip(get_model(optics.model).parameters, optics.parameters.tolist()))
-        more = {k: float(getattr(optics, k)) for k in ("pitch", "middle", "row")}
-        return {"model": optics.model, **parameters, **more}
+        placement = {k: float(getattr(optics, k)) for k in ("pitch", "middle", "row")}
+        return {"model": optics.model, **parameters, **placement}
     if isinstance(optics, AnglePolynomial):
         return {
             "across": optics.across.tolist(),

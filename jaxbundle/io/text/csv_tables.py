@@ -56,7 +56,7 @@ def parse_csv(path: Path, text: str) -> Columns:
     lines = [
         (number, line)
         for number, line in enumerate(re.split(r"\r\n?|\n", text), 1)
-        if (there := line.lstrip()) and there[0] != "#"
+        if (stripped := line.lstrip()) and stripped[0] != "#"
     ]
     try:
         rows = list(csv.reader((line for _, line in lines), skipinitialspace=True, strict=True))
@@ -111,8 +111,8 @@ def take_portions(rows: Iterable[T], portion: int = 10_000) -> Iterator[list[T]]
     """Rows some at a time, for conversion to text: `portion` of them are some megabytes; not
     critical."""
     rows = iter(rows)
-    while taken := list(itertools.islice(rows, portion)):
-        yield taken
+    while portion_of_rows := list(itertools.islice(rows, portion)):
+        yield portion_of_rows
 
 
 def write_text(path: Path, text: str | Iterable[str]) -> None:

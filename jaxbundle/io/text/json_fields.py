@@ -68,16 +68,16 @@ class JsonFields:
         """A text; a number is converted to text."""
         value = self.get(key, default)
         if isinstance(value, bool) or not isinstance(value, str | int | float) or value == "":
-            said = "missing" if value in (None, "") else f"{show(value)}; expected a text"
-            raise InputError(f"{self.path}: {key} is {said}")
+            fault = "missing" if value in (None, "") else f"{show(value)}; expected a text"
+            raise InputError(f"{self.path}: {key} is {fault}")
         return str(value)
 
     def child(self, key: str) -> "JsonFields":
         """The object in a field."""
         value = self.get(key)
         if not isinstance(value, dict):
-            said = "missing" if value is None else f"{show(value)}; expected an object"
-            raise InputError(f"{self.path}: {key} is {said}")
+            fault = "missing" if value is None else f"{show(value)}; expected an object"
+            raise InputError(f"{self.path}: {key} is {fault}")
         return JsonFields(f"{self.path}, {key}", value)
 
     def objects(self, key: str) -> dict[str, "JsonFields"]:

@@ -42,12 +42,12 @@ def may_change_geometry(name: str) -> bool:
     name = HARMLESS.sub("grey", name)
     tokens = re.split(r"[\W_]+", name)
     words = {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
-    joined = "".join(tokens).lower()
+    joined_tokens = "".join(tokens).lower()
     return (
         re.search(r"(?:^|_)T_[A-Za-z]", name) is not None  # T_cam_imu, body_T_cam0: a pose
-        or any(stem in joined for stem in STEMS)
+        or any(stem in joined_tokens for stem in STEMS)
         or not WORDS.isdisjoint(words)
-        or joined.endswith(ENDINGS)
+        or joined_tokens.endswith(ENDINGS)
         or any(COEFFICIENT.fullmatch(word) for word in (*tokens, name))
     )
 
@@ -147,11 +147,13 @@ class UnknownKeys:
             tag = element.tag
             if tag not in keys:
                 tag = next((name for name in patterns if fnmatchcase(tag, name)), tag)
-            own = keys.get(tag, LEAF)
-            self.check_element(element, own, place)
-            used = [c for c in element if isinstance(c.tag, str) and own.uses(c.tag)]
+            keys_of_element = keys.get(tag, LEAF)
+            self.check_element(element, keys_of_element, place)
+            used_children = [
+                c for c in element if isinstance(c.tag, str) and keys_of_element.uses(c.tag)
+            ]
             # From the end of the list: the first of the document is the first to be refused.
-            places += [(child, f"{place}/{child.tag[:60]}") for child in reversed(used)]
+            places += [(child, f"{place}/{child.tag[:60]}") for child in reversed(used_children)]
 
     def check_objects(
         self, document: Mapping[str, Any], keys: Mapping[str, Keys], where: object
@@ -165,18 +167,18 @@ class UnknownKeys:
         while places:
             path, value, place = places.pop()
             self.check(value, keys[path], place)
-            below = []
+            nested = []
             for name, inner in value.items():
-                if (inside := f"{path}.{name}".lstrip(".")) not in keys:
+                if (nested_path := f"{path}.{name}".lstrip(".")) not in keys:
                     continue
                 rows = enumerate(inner) if isinstance(inner, list) else [(None, inner)]
                 for k, row in rows:
                     # What is no object is for its reader to refuse.
                     if isinstance(row, Mapping):
                         number = "" if k is None else f"[{k}]"
-                        below.append((inside, row, f"{place}, {name}{number}"))
+                        nested.append((nested_path, row, f"{place}, {name}{number}"))
             # From the end of the list: the first of the document is the first to be refused.
-            places += reversed(below)
+            places += reversed(nested)
 
     def messages(self) -> tuple[str, ...]:
         """Warnings about the unknown keys."""

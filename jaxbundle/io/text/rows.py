@@ -42,8 +42,8 @@ def parse_numbers(text: str) -> Float[np.ndarray, " n"]:
     """The numbers of a text that blanks and line feeds separate, without a text for each.
 
     **Raises:** `ValueError` for anything else."""
-    if len(text) > LONG_TEXT and (found := _parse_by_arrow(text)) is not None:
-        return found
+    if len(text) > LONG_TEXT and (parsed := _parse_by_arrow(text)) is not None:
+        return parsed
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # about text that is not a number
         try:
@@ -122,14 +122,15 @@ class TextRow:
         """The numbers from the word `first` on, called `what`; no others unless `more`."""
         words = self.words[first:]
         if len(words) < len(what) or (len(words) > len(what) and not more):
-            split = BLANKS if len(words) > len(what) and self.separator is None else ""
+            blank_hint = BLANKS if len(words) > len(what) and self.separator is None else ""
             raise self.error(
-                f"{len(words)} values where {len(what)} are expected ({', '.join(what)}){split}"
+                f"{len(words)} values where {len(what)} are expected "
+                f"({', '.join(what)}){blank_hint}"
             )
         return np.array([self._number(word, name) for word, name in zip(words, what)])
 
-    def all_numbers(self, what: str) -> Float[np.ndarray, " n"]:
-        """All words as numbers; `what` names each in messages."""
+    def all_numbers(self, noun: str) -> Float[np.ndarray, " n"]:
+        """All words as numbers; `noun` names each in messages."""
         try:
             if self.separator is None and len(self.text) > LONG_ROW:
                 numbers = parse_numbers(self.text)
@@ -139,40 +140,42 @@ class TextRow:
             numbers = np.array([np.nan])
         # Python and NumPy read "1_0" as ten; in a file it is a name, or a mistake.
         if not np.isfinite(numbers).all() or "_" in self.text:
-            return np.array([self._number(word, what) for word in self.words])
+            return np.array([self._number(word, noun) for word in self.words])
         return numbers
 
-    def integer(self, k: int, what: str, least: int = 0) -> int:
+    def integer(self, k: int, noun: str, least: int = 0) -> int:
         """The k-th word as a whole number."""
         word = self.words[k] if k < len(self.words) else ""
         digits = word.removeprefix("-")
         # 18 digits fit in 64 bits; isascii, because digits of other scripts count as digits
         if not (digits.isascii() and digits.isdigit() and len(digits) < 19) or int(word) < least:
-            raise self.error(f"{what} is {show(word)}; expected a whole number from {least}")
+            raise self.error(f"{noun} is {show(word)}; expected a whole number from {least}")
         return int(word)
 
-    def rays(self, k: int, thing: str, images: int, image: str) -> Float[np.ndarray, "n 4"]:
+    def rays(self, k: int, noun: str, images: int, image: str) -> Float[np.ndarray, "n 4"]:
         """The rays that end a row, of which number `k` is the count: image, key, x, y each; images
         are numbered from 0 to `images` − 1."""
-        numbers, claimed = self.all_numbers(thing), self.integer(k, "the number of rays")
+        numbers, claimed = self.all_numbers(noun), self.integer(k, "the number of rays")
         if len(numbers) != k + 1 + 4 * claimed:
             raise self.error(
                 f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
                 f"{len(numbers) - k - 1}"
             )
         rays = numbers[k + 1 :].reshape(-1, 4)
-        for one in rays[:, 0]:
-            if not (0 <= one < images and one % 1 == 0):
-                raise self.error(f"{image} {one:g} does not exist; there are {images}, from 0")
+        for image_number in rays[:, 0]:
+            if not (0 <= image_number < images and image_number % 1 == 0):
+                raise self.error(
+                    f"{image} {image_number:g} does not exist; there are {images}, from 0"
+                )
         return rays
 
-    def _number(self, word: str, what: str) -> float:
+    def _number(self, word: str, noun: str) -> float:
         try:
             number = float(word)
         except ValueError:
             number = math.nan
         if not math.isfinite(number) or "_" in word:
-            raise self.error(f"{what} is {show(word)}; expected a number")
+            raise self.error(f"{noun} is {show(word)}; expected a number")
         return number
 
 
@@ -210,14 +213,14 @@ class TextRows:
         """Whether there is another line."""
         return self.position < len(self.lines)
 
-    def take(self, what: str) -> TextRow:
-        """The next line; `what` names the expected content in messages.
+    def take(self, noun: str) -> TextRow:
+        """The next line; `noun` names the expected content in messages.
 
         **Raises:** `InputError` if the file has ended.
         """
         if not self.more():
-            last = self.lines[-1][0] if self.lines else 0
-            raise InputError(f"{self.path}: the file ends after line {last}; expected {what}")
+            last_line = self.lines[-1][0] if self.lines else 0
+            raise InputError(f"{self.path}: the file ends after line {last_line}; expected {noun}")
         number, text = self.lines[self.position]
         self.position += 1
         return TextRow(self.path, number, text, self.separator)

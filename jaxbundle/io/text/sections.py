@@ -82,10 +82,10 @@ class TomlSection:
             raise InputError(f"{self.where}{key} is {show(value)}; expected {expected}")
         return value
 
-    def check_keys(self, known: Sequence[str]) -> None:
+    def check_keys(self, known_keys: Sequence[str]) -> None:
         """Refuse other keys."""
         for key in self.values:
-            refuse_unknown(key, known, self.where)
+            refuse_unknown(key, known_keys, self.where)
 
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""
@@ -116,10 +116,10 @@ class TomlSection:
         good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
         if not good or not values or count not in (None, len(values)):
             raise InputError(f"{self.where}{key} is {show(values)}; expected {expected}")
-        found = np.array(values, float)
-        if not np.isfinite(found).all():
+        array = np.array(values, float)
+        if not np.isfinite(array).all():
             raise InputError(f"{self.where}{key} is {show(values)}; expected finite numbers")
-        return found
+        return array
 
     def path(self, key: str, expected: str, folder: bool = False) -> Path:
         """The file that a key names, beside the file of the section; also a folder, if it may be
@@ -136,13 +136,13 @@ class TomlSection:
 
     def paths(self, key: str, expected: str) -> list[Path]:
         """The files that a key names, one or a list of them."""
-        given = self.values.get(key)
-        if not isinstance(given, list):
+        names_given = self.values.get(key)
+        if not isinstance(names_given, list):
             return [self.path(key, expected)]
-        if not given:
+        if not names_given:
             raise InputError(f"{self.where}{key} is an empty list; expected {expected}")
-        one = lambda name: TomlSection(self.file, self.where, {key: name})
-        return [one(name).path(key, expected) for name in given]
+        section_of = lambda name: TomlSection(self.file, self.where, {key: name})
+        return [section_of(name).path(key, expected) for name in names_given]
 
     def beside(self, name: str) -> Path:
         """The path of a name beside the file of the section."""

@@ -47,21 +47,21 @@ class StoredRows:
 
     def __getitem__(self, rows: int | Sequence[int] | Int[np.ndarray, "..."]) -> np.ndarray:
         """A row, or the rows of a list of numbers."""
-        wanted = np.atleast_1d(np.asarray(rows, int))
+        wanted_rows = np.atleast_1d(np.asarray(rows, int))
         # One array: a list of rows would be copied once more.
-        found = np.empty((len(wanted), *self.shape[1:]), self.dtype)
+        rows_found = np.empty((len(wanted_rows), *self.shape[1:]), self.dtype)
         size = int(np.prod(self.shape[1:]))
         # Consecutive rows are read together.
-        ends = [0, *(np.flatnonzero(np.diff(wanted) != 1) + 1), len(wanted)]
-        there = self.path.open("rb") if self.unpacked is None else nullcontext(self.unpacked)
-        with there as stream:
-            for first, last in zip(ends, ends[1:]):
-                stream.seek(self.offset + int(wanted[first]) * size * self.dtype.itemsize)
-                read = np.fromfile(stream, self.dtype, (last - first) * size)
-                if read.size < (last - first) * size:
+        ends = [0, *(np.flatnonzero(np.diff(wanted_rows) != 1) + 1), len(wanted_rows)]
+        opened = self.path.open("rb") if self.unpacked is None else nullcontext(self.unpacked)
+        with opened as stream:
+            for begin, end in zip(ends, ends[1:]):
+                stream.seek(self.offset + int(wanted_rows[begin]) * size * self.dtype.itemsize)
+                numbers_read = np.fromfile(stream, self.dtype, (end - begin) * size)
+                if numbers_read.size < (end - begin) * size:
                     raise InputError(f"{self.path}: became shorter while it was read")
-                found[first:last] = read.reshape(-1, *self.shape[1:])
-        return found[0] if np.ndim(rows) == 0 else found
+                rows_found[begin:end] = numbers_read.reshape(-1, *self.shape[1:])
+        return rows_found[0] if np.ndim(rows) == 0 else rows_found
 
 
 def find_stored_rows(

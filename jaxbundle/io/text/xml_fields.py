@@ -34,8 +34,8 @@ class XmlFields:
 
     def text(self, key: str, default: str | None = None) -> str:
         """The text of an element."""
-        found = self.find(key)
-        text = default if found is None else (found.text or "")
+        element = self.find(key)
+        text = default if element is None else (element.text or "")
         if text is None:
             raise self.missing(key)
         return text.strip()
@@ -58,20 +58,20 @@ class XmlFields:
 
     def elements(self, key: str) -> list[ET.Element]:
         """Repeated elements, from the first list of them."""
-        parent, _, last = key.rpartition("/")
-        found = self.find(parent)
-        elements = [] if found is None else found.findall(last)
+        parent, _, last_name = key.rpartition("/")
+        parent_element = self.find(parent)
+        elements = [] if parent_element is None else parent_element.findall(last_name)
         if not elements:
             raise self.missing(key)
         return elements
 
     def columns(self, key: str, names: Sequence[str]) -> Float[np.ndarray, "elements names"]:
         """Numbers [elements, names] of repeated elements."""
-        last = key.rpartition("/")[2]
+        last_name = key.rpartition("/")[2]
         return np.array(
             [
                 [
-                    number_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}")
+                    number_in(e.findtext(name, ""), f"{self.path}: {last_name} {k}, {name}")
                     for name in names
                 ]
                 for k, e in enumerate(self.elements(key), 1)
@@ -82,9 +82,9 @@ class XmlFields:
         self, key: str, epoch: np.datetime64, name: str = "TIME"
     ) -> Float[np.ndarray, " elements"]:
         """Seconds since the epoch of repeated elements."""
-        last = key.rpartition("/")[2]
+        last_name = key.rpartition("/")[2]
         times = [
-            time_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}")
+            time_in(e.findtext(name, ""), f"{self.path}: {last_name} {k}, {name}")
             for k, e in enumerate(self.elements(key), 1)
         ]
         return np.array([seconds(t, epoch) for t in times])

@@ -70,10 +70,10 @@ def parse_document(path: str | Path, text: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""
-        told = error.problem or error.context or "damaged"
+        fault = error.problem or error.context or "damaged"
         if mark and any("\t" in line for line in text.split("\n")[mark.line : mark.line + 1]):
-            told += "; blanks indent, not tabs"
-        raise InputError(f"{path}{line}: not valid YAML: {told}") from None
+            fault += "; blanks indent, not tabs"
+        raise InputError(f"{path}{line}: not valid YAML: {fault}") from None
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
@@ -99,10 +99,10 @@ def _look_through(path: str | Path, text: str) -> None:
             if len(open_nodes) > DEEPEST_NESTING:
                 raise error(f"nested too deeply: more than {DEEPEST_NESTING} levels")
         elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, before = open_nodes.pop()
+            anchor, size_before = open_nodes.pop()
             size += 1
             if anchor:
-                sizes[anchor] = size - before
+                sizes[anchor] = size - size_before
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor in (anchor for anchor, _ in open_nodes):
                 raise error(f"the alias *{event.anchor} contains itself")
@@ -143,17 +143,17 @@ def _loader() -> Any:
             if not isinstance(node, yaml.MappingNode):
                 return super().construct_mapping(node, deep)
             keys = [key for key, _ in node.value]
-            seen: set[str] = set()
+            seen_keys: set[str] = set()
             for key in keys:
                 if not isinstance(key, yaml.ScalarNode):
                     raise yaml.MarkedYAMLError(
                         problem="a key is a list or a dictionary", problem_mark=key.start_mark
                     )
-                if key.value in seen and key.value != "<<":
+                if key.value in seen_keys and key.value != "<<":
                     raise yaml.MarkedYAMLError(
                         problem=f"{key.value} occurs twice", problem_mark=key.start_mark
                     )
-                seen.add(key.value)
+                seen_keys.add(key.value)
             self.flatten_mapping(node)
             # The keys as texts, as in JSON: 0 and on are names.
             return {key.value: self.construct_object(value, deep=True) for key, value in node.value}
@@ -181,9 +181,9 @@ def _loader() -> Any:
             return loader.construct_sequence(node, deep=True)
         return loader.construct_scalar(node)
 
-    for tag, form, first in CORE_SCHEMA:
+    for tag, form, first_characters in CORE_SCHEMA:
         tag = f"tag:yaml.org,2002:{tag}"
-        Loader.add_implicit_resolver(tag, re.compile(f"(?:{form})$"), list(first))
+        Loader.add_implicit_resolver(tag, re.compile(f"(?:{form})$"), list(first_characters))
     Loader.add_constructor("tag:yaml.org,2002:int", whole)
     Loader.add_constructor("tag:yaml.org,2002:float", real)
     for prefix in ("tag:yaml.org,2002:", "!", ""):

@@ -22,19 +22,19 @@ _hash = partial(hashlib.blake2b, digest_size=8)
 
 def of_arrays(*arrays: np.ndarray) -> str:
     """The fingerprint of numbers in their shapes, regardless of type."""
-    found = _hash()
+    digest = _hash()
     for array in arrays:
-        found.update(repr(array.shape).encode())
-        found.update(np.ascontiguousarray(array, "<f8").tobytes())
-    return found.hexdigest()
+        digest.update(repr(array.shape).encode())
+        digest.update(np.ascontiguousarray(array, "<f8").tobytes())
+    return digest.hexdigest()
 
 
 def of_words(words: Iterable[str]) -> str:
     """The fingerprint of texts in their order."""
-    found = _hash()
+    digest = _hash()
     for word in words:
-        found.update(word.encode(errors="surrogateescape") + b"\n")
-    return found.hexdigest()
+        digest.update(word.encode(errors="surrogateescape") + b"\n")
+    return digest.hexdigest()
 
 
 def of_input(path: str | Path) -> str:
@@ -42,17 +42,17 @@ def of_input(path: str | Path) -> str:
 
     Unreadable files count as empty.
     """
-    found = _hash()
+    digest = _hash()
     for file in input_files(path):
-        found.update(file.name.encode(errors="surrogateescape"))
+        digest.update(file.name.encode(errors="surrogateescape"))
         try:
             if not is_plain(file):
                 continue
             with file.open("rb") as stream:
-                found.update(hashlib.file_digest(stream, _hash).digest())
+                digest.update(hashlib.file_digest(stream, _hash).digest())
         except OSError:
             continue
-    return found.hexdigest()
+    return digest.hexdigest()
 
 
 def input_files(path: str | Path) -> Iterator[Path]:
@@ -63,13 +63,13 @@ def input_files(path: str | Path) -> Iterator[Path]:
 
 def files_read(path: str | Path) -> list[Path]:
     """An input in TOML, the files it names, and those named by these."""
-    found, left = {}, [Path(path)]
-    while left:
-        file = left.pop()
-        if (real := os.path.realpath(file)) not in found:
-            found[real] = file
-            left += _files(file)
-    return [*found.values()]
+    file_of_path, files_left = {}, [Path(path)]
+    while files_left:
+        file = files_left.pop()
+        if (real := os.path.realpath(file)) not in file_of_path:
+            file_of_path[real] = file
+            files_left += _files(file)
+    return [*file_of_path.values()]
 
 
 def _files(path: Path) -> Iterator[Path]:

@@ -46,32 +46,32 @@ class Marker(NamedTuple):
 
 def check_folder(
     folder: Path,
-    by: str,
+    command: str,
     names: Iterable[str],
     inputs: Iterable[str | Path] = (),
     force: bool = False,
     option: str = "--out",
 ) -> None:
-    """Refuse a folder that the command `by` cannot or may not write (see the module's docstring),
-    before anything is computed.
+    """Refuse a folder that the command `command` cannot or may not write (see the module's
+    docstring), before anything is computed.
 
     **Arguments:** `names`: files to write, as names or patterns with `*`; `inputs`: input files,
     which are never replaced; `option`: the option that gave the folder, for messages.
 
     **Raises:** `InputError`.
     """
-    names, said = tuple(names), f"{option} {folder}".lstrip()
-    _check_place(folder, said)
+    names, folder_in_words = tuple(names), f"{option} {folder}".lstrip()
+    _check_place(folder, folder_in_words)
     real = Path(os.path.realpath(folder))
     recover(folder)
     marker = read_marker(real)
     for path in (Path(os.path.realpath(file)) for file in inputs):
         name = path.relative_to(real).as_posix() if path.is_relative_to(real) else ""
-        known = marker is not None and name in marker.files
-        if known or any(fnmatch.fnmatchcase(name, pattern) for pattern in names):
+        is_known = marker is not None and name in marker.files
+        if is_known or any(fnmatch.fnmatchcase(name, pattern) for pattern in names):
             raise InputError(f"{path} is part of the input and would be overwritten; give another")
     if not force:
-        _refuse_others(folder, real, by, names, said)
+        _refuse_others(folder, real, command, names, folder_in_words)
 
 
 @contextmanager
@@ -227,17 +227,17 @@ def _works(real: Path) -> tuple[Path, Path]:
 def _make_work(real: Path) -> Path:
     """The folder for the new and the old files: beside, if files can be moved from there
     to the folder, which may be on another disk; else inside."""
-    beside, inside = _works(real)
+    folder_beside, folder_inside = _works(real)
     if not real.is_dir():
         # There is nothing yet that could be inside it.
-        beside.mkdir(exist_ok=True)
-        return beside
-    inside.mkdir(exist_ok=True)
+        folder_beside.mkdir(exist_ok=True)
+        return folder_beside
+    folder_inside.mkdir(exist_ok=True)
     try:
-        inside.rename(beside)
+        folder_inside.rename(folder_beside)
     except OSError:
-        return inside
-    return beside
+        return folder_inside
+    return folder_beside
 
 
 def _hold_work(folder: str | Path, work: Path) -> AbstractContextManager[None]:
@@ -246,37 +246,41 @@ def _hold_work(folder: str | Path, work: Path) -> AbstractContextManager[None]:
 
 
 def _replace(
-    folder: Path, real: Path, work: Path, by: str, names: Sequence[str], force: bool
+    folder: Path, real: Path, work: Path, command: str, names: Sequence[str], force: bool
 ) -> None:
     """Replace the old files by the complete new ones."""
     new = work / NEW
     files = {name: _digest(new / name) for name in _files(new)}
-    about = f"Files that jaxbundle {by} has written here, and may replace."
-    text = json.dumps({"about": about, "command": by, "files": files}, ensure_ascii=False, indent=1)
+    about = f"Files that jaxbundle {command} has written here, and may replace."
+    text = json.dumps(
+        {"about": about, "command": command, "files": files}, ensure_ascii=False, indent=1
+    )
     (new / MARKER).write_text(text + "\n", encoding="utf-8")
-    going = []
+    files_to_remove = []
     if real.exists():
         if not force:
-            _refuse_others(folder, real, by, (*files, *names), str(folder))
+            _refuse_others(folder, real, command, (*files, *names), str(folder))
         marker = read_marker(real)
-        own = [name for name in (marker.files if marker else ()) if os.path.lexists(real / name)]
-        going = [*own, *_list_taken(real, names, own)]
-        for name in (*files, *going):
+        own_files = [
+            name for name in (marker.files if marker else ()) if os.path.lexists(real / name)
+        ]
+        files_to_remove = [*own_files, *_list_taken(real, names, own_files)]
+        for name in (*files, *files_to_remove):
             _check_way(real, name)
-            if os.path.lexists(real / name) and name not in going:
+            if os.path.lexists(real / name) and name not in files_to_remove:
                 raise InputError(f"{folder / name}: already there; give a new folder")
     try:
-        with ExitStack() as left:
+        with ExitStack() as cleanup:
             with defer_interrupts():
-                _exchange(real, work, files, going)
+                _exchange(real, work, files, files_to_remove)
                 for name in (OLD, READY):
-                    left.enter_context(temporary(work / name))
+                    cleanup.enter_context(temporary(work / name))
     except BaseException:
         _settle(work, real)
         raise
 
 
-def _exchange(real: Path, work: Path, files: Iterable[str], going: Sequence[str]) -> None:
+def _exchange(real: Path, work: Path, files: Iterable[str], files_to_remove: Sequence[str]) -> None:
     """Replace old files by the new ones, all or none."""
     new, old = work / READY, work / OLD
     os.rename(work / NEW, new)  # from here on `recover` knows that the new files are complete
@@ -285,14 +289,14 @@ def _exchange(real: Path, work: Path, files: Iterable[str], going: Sequence[str]
         return
     try:
         old.mkdir()
-        for name in ([MARKER] if os.path.lexists(real / MARKER) else []) + [*going]:
+        for name in ([MARKER] if os.path.lexists(real / MARKER) else []) + [*files_to_remove]:
             _move(real, old, name)
         for name in (*files, MARKER):
             _move(new, real, name)
     except BaseException:
         _move_back(work, real)
         raise
-    for name in going:
+    for name in files_to_remove:
         # Folders that the old result needed, if nothing else is in them.
         for parent in [*PurePosixPath(name).parents][:-1]:
             with suppress(OSError):
@@ -330,13 +334,13 @@ def _settle(work: Path, real: Path) -> None:
 
 def _files(folder: Path) -> list[str]:
     """All files below a folder, the marker last."""
-    found = [
+    files_found = [
         Path(root, name).relative_to(folder).as_posix()
         for root, _, names in os.walk(folder)
         for name in names
     ]
     # The marker declares the others to be there, so that it must not come before them.
-    return sorted(found, key=lambda name: (name == MARKER, name))
+    return sorted(files_found, key=lambda name: (name == MARKER, name))
 
 
 def _move(source: Path, target: Path, name: str) -> None:

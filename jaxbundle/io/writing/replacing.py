@@ -49,13 +49,13 @@ def replace_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
                 for name, target in zip(names, real):
                     os.replace(name, target)
         except OSError as error:
-            at = dict(zip(map(str, names), paths))
-            raise unwritable(at.get(str(error.filename), paths[0]), error) from None
+            path_of = dict(zip(map(str, names), paths))
+            raise unwritable(path_of.get(str(error.filename), paths[0]), error) from None
         except InputError as error:
-            said = str(error)
+            message = str(error)
             for name, path in zip(names, paths):
-                said = said.replace(str(name), str(path))
-            raise InputError(said) from None
+                message = message.replace(str(name), str(path))
+            raise InputError(message) from None
 
 
 def remove_left_behind(path: str | Path) -> None:
@@ -66,8 +66,8 @@ def remove_left_behind(path: str | Path) -> None:
         return
     pattern = re.compile(rf"\.{re.escape(target.stem[:60])}\.(\d+){re.escape(target.suffix)}")
     for name in os.listdir(target.parent):
-        found = pattern.fullmatch(name)
-        if found is not None and not _is_running(int(found[1])):
+        match = pattern.fullmatch(name)
+        if match is not None and not _is_running(int(match[1])):
             with suppress(OSError):
                 os.unlink(target.with_name(name))
 
