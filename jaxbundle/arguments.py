@@ -78,14 +78,14 @@ def at_least_zero(name: str, value: Any) -> float:
     return number(name, value, "0 or a positive number", lambda x: x >= 0)
 
 
-def one_of(name: str, value: Any, choices: Sequence[str], none: bool = False) -> str | None:
+def one_of(name: str, value: Any, choices: Sequence[str], allow_none: bool = False) -> str | None:
     """One of the given words, or None if allowed.
 
     **Raises:** `InputError`."""
-    if (value is None and none) or (isinstance(value, str) and value in choices):
+    if (value is None and allow_none) or (isinstance(value, str) and value in choices):
         return value
     expected = f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]
-    raise InputError(f"{name} must be {expected}{' or None' * none}, not {show(value)}")
+    raise InputError(f"{name} must be {expected}{' or None' * allow_none}, not {show(value)}")
 
 
 def truth(name: str, value: Any) -> bool:

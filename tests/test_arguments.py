@@ -258,7 +258,8 @@ def test_masks_of_arrays_become_nan():
 @pytest.mark.parametrize("call, said", [
     (lambda: numeric_array("xy", [1j], "pixels"), "xy must be pixels, but contains complex"),
     (lambda: numeric_array("xy", "a", "pixels"), "xy must be pixels, but is 'a'"),
-    (lambda: one_of("snooping", True, ("pope",), none=True), "must be pope or None, not True"),
+    (lambda: one_of("snooping", True, ("pope",), allow_none=True),
+     "must be pope or None, not True"),
     (lambda: one_of("unit", "m", ("mm", "px")), "unit must be one of mm, px, not 'm'"),
 ])  # fmt: skip
 def test_messages_say_what_is_expected_and_what_is_found(call, said):

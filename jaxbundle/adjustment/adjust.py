@@ -387,9 +387,9 @@ def check_options(  # noqa: PLR0913 - the options of an adjustment
 
     **Raises:** `InputError`, naming the option and what is expected."""
     one_of("method", method, METHODS)
-    one_of("reduction", reduction, REDUCTIONS, none=True)
+    one_of("reduction", reduction, REDUCTIONS, allow_none=True)
     integer("max_iterations", max_iterations)
-    one_of("robust", robust, ESTIMATORS, none=True)
+    one_of("robust", robust, ESTIMATORS, allow_none=True)
     check_test(snooping, significance)
     if robust and snooping:
         raise InputError("robust estimation or data snooping, not both at once")

@@ -261,7 +261,7 @@ def make_problem(
     floats.
     """
     require_x64()
-    one_of("reduction", reduction, REDUCTIONS, none=True)
+    one_of("reduction", reduction, REDUCTIONS, allow_none=True)
     require_network(network)
     network = order_cameras(split_check_points(network)[0])
     carries_datum, origin = _datum_points(network), None

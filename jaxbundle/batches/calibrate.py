@@ -110,9 +110,9 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     """
     require_x64()
     max_iterations = integer("max_iterations", max_iterations)
-    one_of("snooping", snooping, TESTS, none=True)
+    one_of("snooping", snooping, TESTS, allow_none=True)
     check_test(snooping, significance)
-    one_of("correlated", correlated, ("batch", "camera"), none=True)
+    one_of("correlated", correlated, ("batch", "camera"), allow_none=True)
     threads = available_cores() if threads is None else integer("threads", threads)
     batch = Batch.check(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)

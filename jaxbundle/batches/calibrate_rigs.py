@@ -162,7 +162,7 @@ def rig_settings(
 
     **Raises:** `InputError`."""
     rig_model = any_model(model)
-    one_of("snooping", snooping, TESTS, none=True)
+    one_of("snooping", snooping, TESTS, allow_none=True)
     check_test(snooping, significance)
     for name, section in sections.items():
         if name not in SECTIONS:

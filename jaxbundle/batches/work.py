@@ -101,7 +101,7 @@ class BatchSettings:
         """The settings from the arguments of `run_batch`.
 
         **Raises:** `InputError`."""
-        one_of("snooping", snooping, TESTS, none=True)
+        one_of("snooping", snooping, TESTS, allow_none=True)
         check_test(snooping, significance)
         if board is not None:
             require_board(board)

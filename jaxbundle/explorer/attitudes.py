@@ -35,7 +35,7 @@ class AttitudeForms(NamedTuple):
 def attitude_forms(angles: Mapping[str, Any], duration: float) -> AttitudeForms:
     """The forms of the angles of a flight; an angle without oscillation begins with one period in
     the image."""
-    known = {}
+    forms_of_file = {}
     for name in NAMES:
         values = {}
         for key, (kind, entry) in FORM.items():
@@ -45,8 +45,8 @@ def attitude_forms(angles: Mapping[str, Any], duration: float) -> AttitudeForms:
             else:
                 value = float(_parts(angles, name)[k].get(entry, 1.0 if key == "period" else 0.0))
                 values[key] = value if key == "period" else shorten_number(np.degrees(value))
-        known[name] = values
-    return AttitudeForms(angles, duration, known)
+        forms_of_file[name] = values
+    return AttitudeForms(angles, duration, forms_of_file)
 
 
 def attitude_controls(forms: AttitudeForms) -> list[Number]:
@@ -71,16 +71,19 @@ def attitude_controls(forms: AttitudeForms) -> list[Number]:
 def choose_angles(forms: AttitudeForms, values: Mapping[str, Any]) -> Mapping[str, Any]:
     """The signals with these values of the controls; those of the file where nothing is changed."""
     changed = {}
-    for name, known in forms.known.items():
+    for name, form_of_file in forms.known.items():
         form = {key: values[f"{name}_{key}"] for key in FORM}
         # Controls show rounded values: an angle that nobody has moved keeps those of the file, to
         # the last digit, and its pictures stay.
-        if form != known:
+        if form != form_of_file:
             parts = [dict(p) if isinstance(p, Mapping) else p for p in _parts(forms.given, name)]
             sine = {"amplitude": np.radians(form["amplitude"]), "period": form["period"]}
-            if form["amplitude"] != known["amplitude"] or form["period"] != known["period"]:
+            if (
+                form["amplitude"] != form_of_file["amplitude"]
+                or form["period"] != form_of_file["period"]
+            ):
                 _change(parts, "sine", sine, {})
-            if form["walk"] != known["walk"]:
+            if form["walk"] != form_of_file["walk"]:
                 # Ten steps in the image, where the file says nothing.
                 _change(
                     parts,

@@ -91,12 +91,12 @@ class CameraView:
 
         **Raises:** `InputError`."""
         check_keys(given, self.values)
-        found = {name: number(given, name, value) for name, value in self.values.items()}
+        parameters = {name: number(given, name, value) for name, value in self.values.items()}
         try:
-            check_parameters(self.model, found)
+            check_parameters(self.model, parameters)
         except ValueError as error:
             raise InputError(str(error)) from None
-        return found
+        return parameters
 
     @property
     def reach(self) -> float:
@@ -130,25 +130,25 @@ class CameraView:
         """`parts`; `radius`, `radial`, `decentring`: the curves; `grid` [lines, points, 2], and how
         far the image moves: `rms`, `largest`."""
         values = self.parameters(given)
-        radius, now, before = self._curves(values)
+        radius, distortion_now, distortion_before = self._curves(values)
         straight, lattice = self._grids(values)
-        moved = lattice - self._grids(self.values)[1]
-        length = np.hypot(moved[..., 0], moved[..., 1])
-        there = np.isfinite(length)
-        rms = float(np.sqrt(np.mean(length[there] ** 2))) if there.any() else float("nan")
-        largest = float(length[there].max()) if there.any() else float("nan")
+        displacement = lattice - self._grids(self.values)[1]
+        length = np.hypot(displacement[..., 0], displacement[..., 1])
+        is_finite = np.isfinite(length)
+        rms = float(np.sqrt(np.mean(length[is_finite] ** 2))) if is_finite.any() else float("nan")
+        largest = float(length[is_finite].max()) if is_finite.any() else float("nan")
         parts = {
-            "curve": self._draw_curve(radius, now, before),
+            "curve": self._draw_curve(radius, distortion_now, distortion_before),
             "grid": self._draw_grid(straight, lattice, rms, largest),
-            "numbers": self._list(values, radius, now, before),
+            "numbers": self._list(values, radius, distortion_now, distortion_before),
         }
         if self.photograph is not None:
             parts["photo"] = self._draw_photograph(self.photograph, values)
         return {
             "parts": parts,
             "radius": radius.tolist(),
-            "radial": now[0].tolist(),
-            "decentring": now[1].tolist(),
+            "radial": distortion_now[0].tolist(),
+            "decentring": distortion_now[1].tolist(),
             "grid": lattice.tolist(),
             "rms": rms,
             "largest": largest,
@@ -210,8 +210,8 @@ class CameraView:
     ) -> tuple[Radii, Distortion, Distortion]:
         """Radius, and radial distortion and decentring [2, radii] of these values and as given."""
         radius = np.linspace(0, self.reach, radii)
-        of = lambda p: distortion_at(self.model, np.array([*p.values()]), radius)[0]
-        return radius, of(values), of(self.values)
+        distortion_of = lambda p: distortion_at(self.model, np.array([*p.values()]), radius)[0]
+        return radius, distortion_of(values), distortion_of(self.values)
 
     def _grids(
         self, values: Mapping[str, float], lines: tuple[int, int] = (13, 9)
@@ -221,14 +221,16 @@ class CameraView:
         axes = [np.linspace(a, b, n) for a, b, n in zip(self.low, self.high, lines)]
         xy = np.stack(np.meshgrid(*axes), -1)
         rays = _plain_rays(self.model, self.values, xy)
-        found = images_of(self.model, values, rays.reshape(-1, 3))
-        return xy, found.reshape(xy.shape)
+        images = images_of(self.model, values, rays.reshape(-1, 3))
+        return xy, images.reshape(xy.shape)
 
-    def _draw_curve(self, radius: Radii, now: Distortion, before: Distortion) -> str:
+    def _draw_curve(
+        self, radius: Radii, distortion_now: Distortion, distortion_before: Distortion
+    ) -> str:
         scale, unit = micrometres(self.model.unit)
         curves = [
-            Curve("as given", radius, scale * before[0], None, "second"),
-            Curve("symmetric radial", radius, scale * now[0]),
+            Curve("as given", radius, scale * distortion_before[0], None, "second"),
+            Curve("symmetric radial", radius, scale * distortion_now[0]),
         ]
         return figure(
             draw_curves(
@@ -250,7 +252,7 @@ class CameraView:
                 lines += [Curve(label, line[:, 0], line[:, 1], None, kind) for line in part]
         unit_of_axes = self.model.unit
         drawing = draw_plan(
-            lines, f"x [{unit_of_axes}]", f"y [{unit_of_axes}]", down=self.model.axes == "down"
+            lines, f"x [{unit_of_axes}]", f"y [{unit_of_axes}]", y_down=self.model.axes == "down"
         )
         return figure(
             drawing,
@@ -262,25 +264,31 @@ class CameraView:
         self,
         values: Mapping[str, float],
         radius: Radii,
-        now: Distortion,
-        before: Distortion,
+        distortion_now: Distortion,
+        distortion_before: Distortion,
         steps: int = 6,
     ) -> str:
         rows = []
         for name, value in values.items():
-            given, sigma = self.values[name], self.sigma.get(name, 0)
-            change = value - given
+            value_before, sigma = self.values[name], self.sigma.get(name, 0)
+            change = value - value_before
             by_sigma = significant(change / sigma) if sigma > 0 else ""
-            both = (significant(x, digits_of(x, sigma)) for x in (given, value))
-            rows.append((name, *both, significant(change), by_sigma))
+            both_values = (significant(x, digits_of(x, sigma)) for x in (value_before, value))
+            rows.append((name, *both_values, significant(change), by_sigma))
         table = grid(("parameter", "as given", "now", "difference", "difference/σ"), rows)
         view = field_of_view_of_rays(self.model, values, self.size, self.camera.pixel_size)
         degrees = ", ".join(f"{np.degrees(angle):.3f}°" for angle in view)
         scale, unit = micrometres(self.model.unit)
-        chosen = np.linspace(0, len(radius) - 1, steps + 1).astype(int)[1:]
+        radii_listed = np.linspace(0, len(radius) - 1, steps + 1).astype(int)[1:]
         rows = [
-            (f"{radius[k]:.4g}", *(significant(scale * x[k]) for x in (before[0], now[0], now[1])))
-            for k in chosen
+            (
+                f"{radius[k]:.4g}",
+                *(
+                    significant(scale * x[k])
+                    for x in (distortion_before[0], distortion_now[0], distortion_now[1])
+                ),
+            )
+            for k in radii_listed
         ]
         header = (
             f"radius [{self.model.unit}]",
@@ -328,15 +336,15 @@ class CameraView:
         """Columns and rows in a photograph of the pixels of its undistorted picture, which has at
         most `max_columns` columns."""
         rows, columns = shape
-        every = max(1.0, columns / max_columns)
-        u, v = (np.arange(0, n - 1 + 1e-9, every) for n in (columns, rows))
+        step = max(1.0, columns / max_columns)
+        u, v = (np.arange(0, n - 1 + 1e-9, step) for n in (columns, rows))
         pixels = np.stack(np.meshgrid(u, v), -1)
         xy = (pixels - self.origin_of_pixels) / self.step
         rays = _plain_rays(self.model, values, xy)
-        found = images_of(self.model, values, rays.reshape(-1, 3)).reshape(xy.shape)
-        found = self.origin_of_pixels + self.step * found
+        images = images_of(self.model, values, rays.reshape(-1, 3)).reshape(xy.shape)
+        images = self.origin_of_pixels + self.step * images
         # A place without image is looked up far outside, where OpenCV leaves white.
-        return tuple(np.nan_to_num(np.moveaxis(found, -1, 0), nan=-1e6))
+        return tuple(np.nan_to_num(np.moveaxis(images, -1, 0), nan=-1e6))
 
 
 def _plain_rays(

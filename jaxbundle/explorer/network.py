@@ -95,19 +95,19 @@ class NetworkView:
 
         **Raises:** `InputError` if it leaves unknowns undetermined."""
         data: Data = dataclasses.replace(self.problem.data, start=start)
-        found = jax.tree.map(np.asarray, self._sigma(data))
-        if not np.isfinite(found.images).all():
+        all_sigma = jax.tree.map(np.asarray, self._sigma(data))
+        if not np.isfinite(all_sigma.images).all():
             raise InputError(
                 "the moved network does not determine all unknowns, or a camera has "
                 "no image of one of its points"
             )
         model = self.adjustment.error_model
         if model is None:
-            return found
+            return all_sigma
         # The same sizes in the moved network: they are of cameras and pictures, not of geometry.
         sigma0 = self.adjustment.sigma0
         errors = precision(self.problem, data, sigma0=sigma0, errors=model.widened_sizes)
-        return _larger(found, jax.tree.map(np.asarray, errors))
+        return _larger(all_sigma, jax.tree.map(np.asarray, errors))
 
     @cached_property
     def before(self) -> Precision:
@@ -121,10 +121,10 @@ class NetworkView:
 
         **Raises:** `InputError`."""
         check_keys(given, ("moves", "aim"))
-        aim, wanted = switch(given, "aim"), given.get("moves", {})
-        if not isinstance(wanted, Mapping):
-            raise InputError(f"moves must be values by station, but is {show(wanted)}")
-        return [self._move(str(id), values, aim) for id, values in wanted.items()]
+        aim, requested = switch(given, "aim"), given.get("moves", {})
+        if not isinstance(requested, Mapping):
+            raise InputError(f"moves must be values by station, but is {show(requested)}")
+        return [self._move(str(id), values, aim) for id, values in requested.items()]
 
     def _move(self, id: str, values: Any, aim: bool) -> Moved:
         if id not in self.ids:
@@ -151,13 +151,13 @@ class NetworkView:
         """M that keeps the image of the centre of the station's points, by the smallest
         rotation."""
         problem = self.problem
-        seen = problem.point[(problem.image == row) & self.adjustment.located[problem.point]]
-        given = self.adjustment.image_values[row]
+        points_seen = problem.point[(problem.image == row) & self.adjustment.located[problem.point]]
+        pose = self.adjustment.image_values[row]
         M = np.asarray(matrix_from_quaternion(self.adjustment.values["image"].rotation[row]))
-        if not len(seen):
+        if not len(points_seen):
             return M
-        middle = self.adjustment.point_values[seen].mean(0)
-        rays = (middle - X for X in (given[:3], centre))
+        middle = self.adjustment.point_values[points_seen].mean(0)
+        rays = (middle - X for X in (pose[:3], centre))
         old, new = (ray / (np.linalg.norm(ray) or 1.0) for ray in rays)
         axis = np.cross(old, new)
         sine, cosine = np.linalg.norm(axis), old @ new
@@ -185,11 +185,17 @@ class NetworkView:
         moves = self.moves(given)
         if not moves:
             return {"parts": {"moved": paragraph("No station is moved.", "hint")}, "stations": {}}
-        before, after = self.before, self.sigma(self.start(moves))
-        parts = [self._say_visibility(moves), self._compare(moves, before, after)]
+        precision_before, precision_after = self.before, self.sigma(self.start(moves))
+        parts = [
+            self._say_visibility(moves),
+            self._compare(moves, precision_before, precision_after),
+        ]
         upper = np.triu_indices(3)  # the six independent elements of a covariance
         six = lambda C: C.reshape(-1, 3, 3)[:, *upper].ravel().tolist()
-        covariance = {"points": after.point_covariance, "images": after.centre_covariance}
+        covariance = {
+            "points": precision_after.point_covariance,
+            "images": precision_after.centre_covariance,
+        }
         return {
             "ellipsoids": {
                 table: {"rows": rows, "elements": six(covariance[table][np.array(rows, int)])}
@@ -203,7 +209,7 @@ class NetworkView:
                     "cameras": p.cameras.tolist(),
                     "images": (p.images * self.units).tolist(),
                 }
-                for when, p in (("before", before), ("after", after))
+                for when, p in (("before", precision_before), ("after", precision_after))
             },
         }
 
@@ -214,8 +220,8 @@ class NetworkView:
         raise InputError(f"there is no file {name!r}; jaxbundle adjust --out writes the tables")
 
     def _describe(self, moved: Moved) -> dict[str, list[float]]:
-        given = self.problem.network.images.angles[moved.row]
-        angles = np.asarray(omega_phi_kappa_near(jnp.asarray(moved.M), jnp.asarray(given)))
+        angles_given = self.problem.network.images.angles[moved.row]
+        angles = np.asarray(omega_phi_kappa_near(jnp.asarray(moved.M), jnp.asarray(angles_given)))
         return {
             "values": (np.concatenate([moved.centre, angles]) * self.units).tolist(),
             "pyramid": self._pyramid(moved).ravel().tolist(),
@@ -232,39 +238,39 @@ class NetworkView:
         from jaxbundle.plotting.views import camera_pyramids, pyramid_size
 
         centres = self.adjustment.image_values[:, :3]
-        near = self.adjustment.point_values[self.adjustment.located]
-        _, size = extent(np.concatenate([near, centres]))
+        located_points = self.adjustment.point_values[self.adjustment.located]
+        _, size = extent(np.concatenate([located_points, centres]))
         pyramids = camera_pyramids(self.adjustment, pyramid_size(centres, size))
         M = np.asarray(jax.vmap(matrix_from_quaternion)(self.adjustment.values["image"].rotation))
         return (pyramids - centres[:, None]) @ M.transpose(0, 2, 1)
 
     def _pyramid(self, moved: Moved) -> Float[np.ndarray, "5 3"]:
-        at = moved.centre - np.array(self._scene["centre"])
-        return at + self._corners[moved.row] @ moved.M
+        position = moved.centre - np.array(self._scene["centre"])
+        return position + self._corners[moved.row] @ moved.M
 
     def _say_visibility(self, moves: list[Moved]) -> str:
         """Messages about image points of moved stations outside the image or behind the camera."""
         problem, lines = self.problem, []
         for moved in moves:
-            used = problem.used
-            rays = np.flatnonzero(used & (problem.image == moved.row))
+            is_used = problem.used
+            rays = np.flatnonzero(is_used & (problem.image == moved.row))
             camera = problem.network.cameras[problem.network.images.camera[moved.row]]
             model = get_model(camera.model)
-            low, high, known = image_frame(self.adjustment, camera.id)
+            low, high, is_known = image_frame(self.adjustment, camera.id)
             p = self.adjustment.camera_parameters(camera.id)
             X = np.asarray(coordinates(self.adjustment.values))[problem.point[rays]]
             ray = (X - (moved.centre - problem.origin)) @ moved.M.T
             xy = images_of(model, p, ray)
             behind = np.zeros(len(rays), bool) if model.wide else ray[:, 2] >= 0
-            outside = ~((xy >= low) & (xy <= high)).all(1) & known
-            lost = int((behind | outside).sum())
-            if lost:
+            is_outside = ~((xy >= low) & (xy <= high)).all(1) & is_known
+            number_lost = int((behind | is_outside).sum())
+            if number_lost:
                 lines.append(
-                    f"{lost} of {count(len(rays), 'image point')} of image "
+                    f"{number_lost} of {count(len(rays), 'image point')} of image "
                     f"{clean(self.ids[moved.row])} would be outside the image or behind "
                     "the camera; the σ below still include them"
                 )
-            elif not known:
+            elif not is_known:
                 lines.append(
                     f"the size of the images of camera {clean(camera.id)} is not known: "
                     "whether all image points lie in them is not checked"
@@ -272,32 +278,42 @@ class NetworkView:
         return "".join(paragraph(f"{line}.", "hint") for line in lines)
 
     def _compare(
-        self, moves: list[Moved], before: Precision, after: Precision, max_points: int = 200
+        self,
+        moves: list[Moved],
+        precision_before: Precision,
+        precision_after: Precision,
+        max_points: int = 200,
     ) -> str:
         """The σ before and after: of all points together, cameras, moved stations, and of the
         points that change most."""
         network, unit = self.problem.network, clean(self.adjustment.network.object_unit)
         # Held points have σ 0 before and after.
-        near = self.adjustment.located & (before.points > 0).any(1)
-        root = lambda s: np.sqrt(np.mean(s[near] ** 2, 0))
+        is_near = self.adjustment.located & (precision_before.points > 0).any(1)
+        root = lambda s: np.sqrt(np.mean(s[is_near] ** 2, 0))
         rows = (
             [
                 (f"σ{axis} of the points, RMS [{unit}]", a, b)
-                for axis, a, b in zip("XYZ", root(before.points), root(after.points))
+                for axis, a, b in zip(
+                    "XYZ", root(precision_before.points), root(precision_after.points)
+                )
             ]
-            if near.any()
+            if is_near.any()
             else []
         )
         for c, camera in enumerate(network.cameras):
             names = get_model(camera.model).parameters
             rows += [
-                (f"σ {name} of camera {camera.id}", before.cameras[c, k], after.cameras[c, k])
+                (
+                    f"σ {name} of camera {camera.id}",
+                    precision_before.cameras[c, k],
+                    precision_after.cameras[c, k],
+                )
                 for k, name in enumerate(names)
-                if before.cameras[c, k] > 0
+                if precision_before.cameras[c, k] > 0
             ]
         units = dict(zip(EXTERIOR, [unit] * 3 + [network.angle_unit] * 3))
         for moved in moves:
-            a, b = (p.images[moved.row] * self.units for p in (before, after))
+            a, b = (p.images[moved.row] * self.units for p in (precision_before, precision_after))
             rows += [
                 (
                     f"σ {MEANING.get(name, name)} of image {self.ids[moved.row]} [{units[name]}]",
@@ -310,32 +326,36 @@ class NetworkView:
         header = ("", "as adjusted", "moved", "change")
         table = grid(header, [(name, *_pair(a, b)) for name, a, b in rows])
         ids = np.array(network.points.id, dtype=object)
-        change = np.where(near, np.abs(np.log(_ratio(before.points, after.points))), -1)
-        order = [p for p in np.argsort(-change)[:max_points] if near[p]]
+        change = np.where(
+            is_near, np.abs(np.log(_ratio(precision_before.points, precision_after.points))), -1
+        )
+        order = [p for p in np.argsort(-change)[:max_points] if is_near[p]]
         points = [
             (
                 ids[p],
                 *(
                     significant(float(s))
                     for axis in range(3)
-                    for s in (before.points[p, axis], after.points[p, axis])
+                    for s in (precision_before.points[p, axis], precision_after.points[p, axis])
                 ),
             )
             for p in order
         ]
         header = ("point", *(f"σ{axis} {when}" for axis in "XYZ" for when in ("before", "after")))
-        more = f"<h3>Points, the largest change first [{text(unit)}]</h3>\n" + grid(header, points)
-        return table + more
+        table_of_points = f"<h3>Points, the largest change first [{text(unit)}]</h3>\n" + grid(
+            header, points
+        )
+        return table + table_of_points
 
     def page(self, given: Given, live: bool) -> Page:
         """The network of the report to turn, and the place for the chosen station and its moves."""
-        found, answer = self.adjustment, self.answer(given)
-        drawings = {"network-data": self._scene, "frames": describe_frames(found)}
-        title = f"{clean(found.network.name) or 'network'}: explorer"
+        adjustment, answer = self.adjustment, self.answer(given)
+        drawings = {"network-data": self._scene, "frames": describe_frames(adjustment)}
+        title = f"{clean(adjustment.network.name) or 'network'}: explorer"
         shown_first = give_verdict(
-            found.verdict.findings,
-            found.warnings,
-            facts(row for row in summary(found) if row[0] != "Note"),
+            adjustment.verdict.findings,
+            adjustment.warnings,
+            facts(row for row in summary(adjustment) if row[0] != "Note"),
         )
         sections = [
             shown_first,
@@ -352,7 +372,7 @@ class NetworkView:
             live,
             "network",
             answer,
-            tables=collect_tables(found),
+            tables=collect_tables(adjustment),
             drawings=drawings,
             given=state,
         )
@@ -394,17 +414,17 @@ class NetworkView:
         return Section("move", "Move a station", "".join(parts), "Move a station")
 
 
-def _larger(one: Precision, other: Precision) -> Precision:
+def _larger(precision_a: Precision, precision_b: Precision) -> Precision:
     """The larger σ of every unknown, and of two covariances that of the larger trace."""
-    first = lambda a, b: np.trace(a, axis1=1, axis2=2) >= np.trace(b, axis1=1, axis2=2)
-    pick = lambda a, b: np.where(first(a, b)[:, None, None], a, b)
+    is_first_larger = lambda a, b: np.trace(a, axis1=1, axis2=2) >= np.trace(b, axis1=1, axis2=2)
+    pick = lambda a, b: np.where(is_first_larger(a, b)[:, None, None], a, b)
     return Precision(
-        images=np.maximum(one.images, other.images),
-        cameras=np.maximum(one.cameras, other.cameras),
-        points=np.maximum(one.points, other.points),
-        covariance=one.covariance,
-        point_covariance=pick(one.point_covariance, other.point_covariance),
-        centre_covariance=pick(one.centre_covariance, other.centre_covariance),
+        images=np.maximum(precision_a.images, precision_b.images),
+        cameras=np.maximum(precision_a.cameras, precision_b.cameras),
+        points=np.maximum(precision_a.points, precision_b.points),
+        covariance=precision_a.covariance,
+        point_covariance=pick(precision_a.point_covariance, precision_b.point_covariance),
+        centre_covariance=pick(precision_a.centre_covariance, precision_b.centre_covariance),
     )
 
 
@@ -423,10 +443,10 @@ def _selection() -> Section:
 
 
 def _ratio(
-    before: Float[AnyArray, "points 3"], after: Float[AnyArray, "points 3"]
+    sigma_before: Float[AnyArray, "points 3"], sigma_after: Float[AnyArray, "points 3"]
 ) -> Float[np.ndarray, " points"]:
     """Ratio of the means of σ² of points."""
-    a, b = (np.sqrt(np.mean(s**2, 1)) for s in (before, after))
+    a, b = (np.sqrt(np.mean(s**2, 1)) for s in (sigma_before, sigma_after))
     return np.where((a > 0) & (b > 0), b / np.where(a > 0, a, 1.0), 1.0)
 
 

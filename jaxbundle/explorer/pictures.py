@@ -83,9 +83,9 @@ class Taken(NamedTuple):
     @property
     def rms(self) -> float:
         """Map − scene where both are, RMS of the grey values; NaN where nothing is."""
-        off = self.map - self.scene
-        off = off[np.isfinite(off)]
-        return float(np.sqrt(np.mean(off**2))) if off.size else float("nan")
+        difference = self.map - self.scene
+        difference = difference[np.isfinite(difference)]
+        return float(np.sqrt(np.mean(difference**2))) if difference.size else float("nan")
 
 
 def frame_around(
@@ -177,19 +177,19 @@ def scene_of_raster(
     steps = [_pixels_between(v) for v in (row, column)]
     bands = _means(bands, steps)
     row, column = ((v + 0.5) / k - 0.5 for v, k in zip((row, column), steps))
-    found = np.asarray(_resample(bands, row, column, "bilinear"))
-    if not np.isfinite(found).any():
+    resampled = np.asarray(_resample(bands, row, column, "bilinear"))
+    if not np.isfinite(resampled).any():
         raise InputError("the scene is not where the image looks: check track and coordinates")
-    low, high = np.nanmin(found), np.nanmax(found)
-    return 255 * (found - low) / (high - low if high > low else 1.0)
+    low, high = np.nanmin(resampled), np.nanmax(resampled)
+    return 255 * (resampled - low) / (high - low if high > low else 1.0)
 
 
 def draw_pictures(taken: Taken, frame: GroundFrame, resampling: Resampling) -> str:
     """The three pictures with their captions."""
-    every = " and ".join(
+    steps_in_words = " and ".join(
         f"every {k}th {name}" for k, name in zip(taken.step, ("line", "pixel")) if k > 1
     )
-    told = (
+    difference_in_words = (
         "nothing of the scene is on the map"
         if np.isnan(taken.rms)
         else f"RMS difference from the scene {significant(taken.rms, 3)} of 255 grey values"
@@ -197,14 +197,22 @@ def draw_pictures(taken: Taken, frame: GroundFrame, resampling: Resampling) -> s
     size = significant(frame.size, 3)
     pictures = [
         ("scene", taken.scene, f"Scene, north at the top, pixels of {size} m"),
-        ("distorted", taken.image, f"Image, line 0 at the top{', ' if every else ''}{every}"),
-        ("corrected", taken.map, f"Map by the recorded trajectory, {resampling}: {told}"),
+        (
+            "distorted",
+            taken.image,
+            f"Image, line 0 at the top{', ' if steps_in_words else ''}{steps_in_words}",
+        ),
+        (
+            "corrected",
+            taken.map,
+            f"Map by the recorded trajectory, {resampling}: {difference_in_words}",
+        ),
     ]
-    drawn = "".join(
+    figures = "".join(
         figure(f'<img alt="{name}" src="data:image/png;base64,{_encode(grey)}">\n', words)
         for name, grey, words in pictures
     )
-    return f'<div class="pictures">\n{drawn}</div>\n'
+    return f'<div class="pictures">\n{figures}</div>\n'
 
 
 def without_pictures(why: InputError) -> str:
@@ -237,8 +245,8 @@ def _ground_below(
     """The points of the surface on the verticals of the plane."""
     x, y = frame.left + (column + 0.5) * frame.size, frame.top - (row + 0.5) * frame.size
     # From 1000 km above: the ground is below it, and nothing of the vertical is on the far side.
-    above = np.full(x.size, 1e6)
-    start = frame.origin[:, None] + frame.axes.T @ np.stack([x.ravel(), y.ravel(), above])
+    heights = np.full(x.size, 1e6)
+    start = frame.origin[:, None] + frame.axes.T @ np.stack([x.ravel(), y.ravel(), heights])
     X = np.asarray(_drop(surface, jnp.asarray(start), jnp.asarray(-frame.axes[2])))
     return X.reshape(3, *x.shape)
 
@@ -257,16 +265,16 @@ def _means(
     rows, columns = (n // k for n, k in zip(bands.shape[1:], steps))
     if min(rows, columns) == 0:
         return bands.mean((1, 2), keepdims=True)
-    cut = bands[:, : rows * steps[0], : columns * steps[1]]
-    return cut.reshape(len(bands), rows, steps[0], columns, steps[1]).mean((2, 4))
+    whole_blocks = bands[:, : rows * steps[0], : columns * steps[1]]
+    return whole_blocks.reshape(len(bands), rows, steps[0], columns, steps[1]).mean((2, 4))
 
 
 def _encode(grey: Float[np.ndarray, "bands rows columns"]) -> str:
     """A PNG picture, base64; what is NaN is white."""
     cv2 = need_opencv()
-    whole = np.clip(np.round(np.nan_to_num(grey, nan=255.0)), 0, 255).astype(np.uint8)
+    grey_values = np.clip(np.round(np.nan_to_num(grey, nan=255.0)), 0, 255).astype(np.uint8)
     # OpenCV's colours are blue, green, red
-    _, coded = cv2.imencode(".png", np.moveaxis(whole, 0, -1)[..., ::-1])
+    _, coded = cv2.imencode(".png", np.moveaxis(grey_values, 0, -1)[..., ::-1])
     return base64.b64encode(coded.tobytes()).decode("ascii")
 
 

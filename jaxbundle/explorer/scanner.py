@@ -166,14 +166,14 @@ class FlightView:
         quaternions = attitude.table.values.shape[1] == 4
         ways = [m for m in METHODS if m != "hermite" or position.rates is not None]
         turns = [m for m in METHODS if m != "hermite"] + ["slerp"] * quaternions
-        found: list[Control] = []
+        all_controls: list[Control] = []
         if self.tracks is not None and self.forms is not None:
-            found += [
+            all_controls += [
                 Choice("track", "trajectory", self.tracks.kind, (ORBIT, PLACES, STRAIGHT)),
                 *track_controls(self.tracks),
                 *attitude_controls(self.forms),
             ]
-        found += [
+        all_controls += [
             Choice(
                 "position_interpolation", "interpolation of the position", position.method, ways
             ),
@@ -184,9 +184,9 @@ class FlightView:
                 turns,
             ),
         ]
-        found += [Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES]
+        all_controls += [Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES]
         if self.flight is not None:
-            found += [
+            all_controls += [
                 Number("position_rate", "samples of the position", self.flight.position_rate, "Hz"),
                 Number("attitude_rate", "samples of the attitude", self.flight.attitude_rate, "Hz"),
                 Number(
@@ -203,12 +203,12 @@ class FlightView:
                 ),
             ]
         if self.earth is not None or self.tracks is not None:
-            found += [
-                Switch(name, name.replace("_", " "), on)
-                for name, on in zip(Corrections._fields, self.image.corrections)
+            all_controls += [
+                Switch(name, name.replace("_", " "), is_on)
+                for name, is_on in zip(Corrections._fields, self.image.corrections)
             ]
         return [
-            *found,
+            *all_controls,
             Number("ground", "height of the ground", 0.0, "m"),
             Choice("resampling", "resampling of the pictures", "bilinear", RESAMPLINGS),
         ]
@@ -218,24 +218,46 @@ class FlightView:
 
         **Raises:** `InputError`."""
         check_keys(given, [control.key for control in self.controls])
-        found: dict[str, Any] = {}
-        for one in self.controls:
-            if isinstance(one, Number):
-                positive = one.key.endswith(POSITIVE_KEYS) or one.key == "height"
-                found[one.key] = number(given, one.key, one.value, 0.0 if positive else -np.inf)
-                if one.key.endswith("period") and not found[one.key] > 0:
-                    raise InputError(f"{one.key} is {found[one.key]:g}; expected a number above 0")
-                if one.key.endswith("latitude") and not abs(found[one.key]) <= 90:
+        all_values: dict[str, Any] = {}
+        for known_control in self.controls:
+            if isinstance(known_control, Number):
+                positive = (
+                    known_control.key.endswith(POSITIVE_KEYS) or known_control.key == "height"
+                )
+                all_values[known_control.key] = number(
+                    given, known_control.key, known_control.value, 0.0 if positive else -np.inf
+                )
+                if known_control.key.endswith("period") and not all_values[known_control.key] > 0:
                     raise InputError(
-                        f"{one.key} is {found[one.key]:g}; expected a number from -90 to 90"
+                        f"{known_control.key} is {all_values[known_control.key]:g}; expected a "
+                        "number above 0"
                     )
-                if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
-                    raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")
-            elif isinstance(one, Switch):
-                found[one.key] = switch({one.key: given.get(one.key, one.value)}, one.key)
+                if (
+                    known_control.key.endswith("latitude")
+                    and not abs(all_values[known_control.key]) <= 90
+                ):
+                    raise InputError(
+                        f"{known_control.key} is {all_values[known_control.key]:g}; expected a "
+                        "number from -90 to 90"
+                    )
+                if (
+                    known_control.key.endswith("rate")
+                    and not 0 < all_values[known_control.key] <= 1000
+                ):
+                    raise InputError(
+                        f"{known_control.key} is {all_values[known_control.key]:g}; above 0, to "
+                        "1000 Hz"
+                    )
+            elif isinstance(known_control, Switch):
+                all_values[known_control.key] = switch(
+                    {known_control.key: given.get(known_control.key, known_control.value)},
+                    known_control.key,
+                )
             else:
-                found[one.key] = word(given, one.key, one.value, one.words)
-        return found
+                all_values[known_control.key] = word(
+                    given, known_control.key, known_control.value, known_control.words
+                )
+        return all_values
 
     def choose(self, values: Mapping[str, Any]) -> Chosen:
         """The image with these values.
@@ -245,8 +267,8 @@ class FlightView:
         if self.flight is not None and self.tracks is not None:
             flight = self._flight_with(self.flight, self.tracks, values)
             image = measured_image(flight)
-            given = self.flight
-            if flight.track is not given.track or flight.angles is not given.angles:
+            flight_given = self.flight
+            if flight.track is not flight_given.track or flight.angles is not flight_given.angles:
                 truth = true_image(flight)
             earth = None if values["track"] == STRAIGHT else self.tracks.earth
         trajectory = Trajectory(
@@ -277,7 +299,9 @@ class FlightView:
         noise = flight.noise
         for name, unit in (("attitude_white", np.pi / 180), ("position_white", 1.0)):
             # A σ for every axis stays as the file has it until it is changed.
-            if values[name] != next(one.value for one in self.controls if one.key == name):
+            if values[name] != next(
+                control.value for control in self.controls if control.key == name
+            ):
                 noise = noise._replace(**{name: unit * values[name]})
         names = (
             "position_interpolation",
@@ -311,7 +335,7 @@ class FlightView:
             )
         expected = self._expected_accuracy(chosen)
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
-        told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
+        error_figures = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
         field = self._rms_of_cells(length)
         pictures, difference = self._draw_pictures(chosen, values)
         return {
@@ -319,10 +343,10 @@ class FlightView:
                 "flight": draw_flight(chosen.image, chosen.truth, chosen.earth),
                 "pictures": pictures,
                 "ground": draw_ground(chosen.image, chosen.truth, chosen.surface, chosen.earth),
-                "errors": draw_errors(field, told),
-                "accuracy": draw_accuracy(told, errors, expected),
+                "errors": draw_errors(field, error_figures),
+                "accuracy": draw_accuracy(error_figures, errors, expected),
             },
-            **told,
+            **error_figures,
             "errors": field.tolist(),
             "expected": expected,
             "difference": difference,
@@ -359,9 +383,9 @@ class FlightView:
         controls = [_with_value(control, values[control.key]) for control in self.controls]
         image = self.image
         if self.flight is not None:
-            against = "the true trajectory of the flight"
+            reference = "the true trajectory of the flight"
         else:
-            against = "the given truth" if self.known else "the image as its file has it"
+            reference = "the given truth" if self.known else "the image as its file has it"
         exports = {
             "Flight file (zip)": FLIGHT_FILE,
             "Table (CSV)": TABLE_FILE,
@@ -375,7 +399,7 @@ class FlightView:
                     [
                         paragraph(
                             f"{image.lines} lines of {image.pixels} pixels; errors are against "
-                            f"{against}."
+                            f"{reference}."
                         ),
                         draw_controls(controls, live),
                         draw_tools(live, exports),
@@ -422,8 +446,8 @@ class FlightView:
         image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
         # A constant error has no structure that a few positions could miss.
-        spread = spread_positions(image.lines, image.pixels, self.cells, 1)
-        line, pixel = (v.ravel() for v in spread)
+        positions = spread_positions(image.lines, image.pixels, self.cells, 1)
+        line, pixel = (v.ravel() for v in positions)
         rows = []
         for level in levels:
             sigma = np.radians(level)
@@ -482,11 +506,11 @@ class FlightView:
         try:
             taken = self._take_pictures(chosen, values)
             frame, _ = self._scene(values.get("track", ""), chosen)
-            drawn = draw_pictures(taken, frame, _kernel(values))
+            figures = draw_pictures(taken, frame, _kernel(values))
             if self.raster is not None and not self._has_coordinates_of_raster(chosen):
                 words = "The scene has coordinates of the file's track: a pattern is in its place."
-                drawn = paragraph(words, "hint") + drawn
-            return drawn, taken.rms
+                figures = paragraph(words, "hint") + figures
+            return figures, taken.rms
         except InputError as error:
             return without_pictures(error), None
 
@@ -520,13 +544,19 @@ class FlightView:
         size = self.image.lines, self.image.pixels
         lines, pixels = ((np.arange(k) + 0.5) * n / k - 0.5 for k, n in zip(self.cells, size))
         length = np.hypot(*self._errors(chosen).T)
-        told = f"RMS {np.sqrt(np.mean(length**2)):.3g} m"
+        overall = f"RMS {np.sqrt(np.mean(length**2)):.3g} m"
         try:
             return png(
                 (7.5, 6),
                 None,
                 lambda ax: image_map(
-                    lines, pixels, self._rms_of_cells(length), "Error on the ground", "m", told, ax
+                    lines,
+                    pixels,
+                    self._rms_of_cells(length),
+                    "Error on the ground",
+                    "m",
+                    overall,
+                    ax,
                 ),
             )
         except ImportError as error:

@@ -31,7 +31,8 @@ def draw_flight(
     orbital or the local frame."""
     lines = np.linspace(0, image.lines - 1, places)
     angles = [
-        np.degrees(_angles(one, jnp.asarray(lines), earth is not None)) for one in (truth, image)
+        np.degrees(_angles(image_or_truth, jnp.asarray(lines), earth is not None))
+        for image_or_truth in (truth, image)
     ]
     charts = []
     for name, k in ANGLES.items():
@@ -39,8 +40,8 @@ def draw_flight(
             Curve(label, lines, values[k], None, kind)
             for values, label, kind in zip(angles, ("true", "recorded"), ("second", "first"))
         ]
-        drawn = draw_curves(curves, "line", f"{name} [°]", layout=ChartLayout(height=220))
-        charts.append(figure(drawn, name))
+        chart = draw_curves(curves, "line", f"{name} [°]", layout=ChartLayout(height=220))
+        charts.append(figure(chart, name))
     ends = np.array(_positions(truth, jnp.asarray([0.0, image.lines - 1.0])))
     if earth is None:
         header = ("track", "X [m]", "Y [m]", "Z [m]")
@@ -54,12 +55,12 @@ def draw_flight(
         ]
     seconds = float(image.times.time(image.lines - 1.0) - image.times.time(0.0))
     length = np.linalg.norm(ends[1] - ends[0])
-    told = f"{seconds:.6g} s, {length:.6g} m"
+    length_and_speed = f"{seconds:.6g} s, {length:.6g} m"
     if seconds > 0:
-        told += f", {length / seconds:.6g} m/s"
+        length_and_speed += f", {length / seconds:.6g} m/s"
     return (
         grid(header, [("first line", *rows[0]), ("last line", *rows[1])])
-        + paragraph(f"From the first line to the last: {told}.", "hint")
+        + paragraph(f"From the first line to the last: {length_and_speed}.", "hint")
         + f'<div class="pictures">\n{"".join(charts)}</div>\n'
     )
 
@@ -100,30 +101,30 @@ def draw_ground(
     )
 
 
-def draw_errors(field: Float[np.ndarray, "rows columns"], told: Mapping[str, float]) -> str:
-    """The error map; `told`: `rms` and `ce90` over the whole image, metres."""
+def draw_errors(field: Float[np.ndarray, "rows columns"], overall: Mapping[str, float]) -> str:
+    """The error map; `overall`: `rms` and `ce90` over the whole image, metres."""
     return figure(
         draw_field(field, 3),
         f"Error on the ground in metres, RMS of each part of the image, line 0 at the top: RMS "
-        f"{significant(told['rms'])} m, CE90 {significant(told['ce90'])} m",
+        f"{significant(overall['rms'])} m, CE90 {significant(overall['ce90'])} m",
     )
 
 
 def draw_accuracy(
-    told: Mapping[str, float],
+    overall: Mapping[str, float],
     errors: Float[np.ndarray, "n 2"],
     expected: Sequence[Mapping[str, float]],
 ) -> str:
     """The table of errors on the ground, and that of the accuracy expected of attitudes."""
     east, north = np.sqrt(np.mean(errors**2, 0))
     rows = [
-        ("RMS", told["rms"]),
+        ("RMS", overall["rms"]),
         ("RMS east", east),
         ("RMS north", north),
-        ("CE90", told["ce90"]),
-        ("largest", told["largest"]),
+        ("CE90", overall["ce90"]),
+        ("largest", overall["largest"]),
     ]
-    first = grid(("error on the ground", "m"), [(n, significant(v, 4)) for n, v in rows])
+    table_of_errors = grid(("error on the ground", "m"), [(n, significant(v, 4)) for n, v in rows])
     header = (
         "σ of the attitude, each axis",
         "RMS [m]",
@@ -136,7 +137,7 @@ def draw_accuracy(
         (f"{row['sigma']:g}°", *(significant(row[name], 4) for name in names)) for row in expected
     ]
     return (
-        first
+        table_of_errors
         + "<h3>Expected accuracy for a constant error over the image</h3>\n"
         + grid(header, table)
     )
@@ -144,10 +145,10 @@ def draw_accuracy(
 
 def outline(image: PushbroomImage, places: int = 9) -> tuple[np.ndarray, np.ndarray]:
     """Lines and pixels around the image, closed, at `places` places of each side."""
-    s, zero, one = np.linspace(0, 1, places), np.zeros(places), np.ones(places)
-    down = np.concatenate([zero, s, one, s[::-1]])
-    across = np.concatenate([s, one, s[::-1], zero])
-    return down * (image.lines - 1), across * (image.pixels - 1)
+    s, zero, ones = np.linspace(0, 1, places), np.zeros(places), np.ones(places)
+    line_share = np.concatenate([zero, s, ones, s[::-1]])
+    pixel_share = np.concatenate([s, ones, s[::-1], zero])
+    return line_share * (image.lines - 1), pixel_share * (image.pixels - 1)
 
 
 _locate = jax.jit(locate_points)

@@ -114,11 +114,11 @@ class Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """The answer to values, or a file made from them."""
         length = self.headers.get("Content-Length", "")
-        known = length.isascii() and length.isdigit() and len(length) < 10
+        is_number = length.isascii() and length.isdigit() and len(length) < 10
         # Read before it is answered, or the browser would lose the answer; of an oversized one at
         # most 16 times what is allowed.
-        expected = min(int(length), 16 * MOST_BYTES) if known else 0
-        body = self.rfile.read(expected) if known else None
+        expected = min(int(length), 16 * MOST_BYTES) if is_number else 0
+        body = self.rfile.read(expected) if is_number else None
         if body is not None and len(body) < expected:
             return self._respond(_refuse_incomplete, b"")
         self._respond(self._post, body)
@@ -168,18 +168,18 @@ class Handler(BaseHTTPRequestHandler):
         **Raises:** `Refused` without the token, and for another name of this machine: a site whose
         name leads here must not speak with it."""
         hosts = [f"{name}:{self.server.server_port}" for name in (HOST, "localhost")]
-        given, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
-        if len(given) != 1 or given[0] not in hosts:
+        hosts_given, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
+        if len(hosts_given) != 1 or hosts_given[0] not in hosts:
             raise Refused(HTTPStatus.FORBIDDEN, f"this page is served at {HOST} only")
         if any(origin not in [f"http://{host}" for host in hosts] for origin in origins):
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another site may not ask")
-        _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
+        _, token, *path_after_token = [*self.path.partition("?")[0].split("/"), ""]
         # In constant time: how long it takes tells nothing about the token.
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
             raise Refused(
                 HTTPStatus.FORBIDDEN, "the address is incomplete: copy all of it from the terminal"
             )
-        return "/".join(rest).rstrip("/")
+        return "/".join(path_after_token).rstrip("/")
 
     def _get(self, action: str, _: bytes) -> File:
         if action or not self.path.endswith("/"):

@@ -54,12 +54,12 @@ def tracks_of(track: Mapping[str, Any], image: PushbroomImage, earth: Ellipsoid 
         orbit = dict(USUAL)
         radians = {k: np.radians(v) if k != "height" else v for k, v in orbit.items()}
         on_earth = list(circular_orbit(np.array(times), **radians)[0])
-        known = {
+        values_of_tracks = {
             ORBIT: orbit,
             PLACES: _geodetic_ends(on_earth, WGS84, 8),
             STRAIGHT: _values(ends, LOCAL),
         }
-        return Tracks(STRAIGHT, track, WGS84, known)
+        return Tracks(STRAIGHT, track, WGS84, values_of_tracks)
     orbit = {name: shorten_number(np.degrees(track.get(name, 0.0))) for name in USUAL}
     orbit = {**orbit, "height": float(track["height"])} if "height" in track else {}
     if "end" in track:
@@ -72,12 +72,12 @@ def tracks_of(track: Mapping[str, Any], image: PushbroomImage, earth: Ellipsoid 
     length = np.linalg.norm(ends[1] - ends[0]) * float(earth.a) / radius.mean()
     altitude = radius.mean() - float(earth.a)
     straight = [np.array([0.0, y, altitude]) for y in (0.0, length)]
-    known = {
+    values_of_tracks = {
         ORBIT: orbit,
         PLACES: _geodetic_ends(ends, earth, 12 if "end" in track else 8),
         STRAIGHT: _values(straight, LOCAL, 6),
     }
-    return Tracks(PLACES if "end" in track else ORBIT, track, earth, known)
+    return Tracks(PLACES if "end" in track else ORBIT, track, earth, values_of_tracks)
 
 
 def track_controls(tracks: Tracks) -> list[Number]:
@@ -92,33 +92,44 @@ def track_controls(tracks: Tracks) -> list[Number]:
         for key, value in values.items():
             end, axis = key.split("_")
             # Half the track to either side, and half the height.
-            half = abs(value) / 2 if axis in ("height", "Z") else reach[axis] / 2
+            half_range = abs(value) / 2 if axis in ("height", "Z") else reach[axis] / 2
             controls.append(
-                Number(key, f"{ENDS[end]}: {axis}", value, units[axis], value - half, value + half)
+                Number(
+                    key,
+                    f"{ENDS[end]}: {axis}",
+                    value,
+                    units[axis],
+                    value - half_range,
+                    value + half_range,
+                )
             )
     return controls
 
 
 def idle_controls(tracks: Tracks, kind: str) -> list[str]:
     """The keys of the tracks that are not chosen."""
-    return [name for other, values in tracks.known.items() if other != kind for name in values]
+    return [
+        name for other_kind, values in tracks.known.items() if other_kind != kind for name in values
+    ]
 
 
 def choose_track(tracks: Tracks, values: Mapping[str, Any]) -> Mapping[str, Any]:
     """The track `values["track"]` with its values; the given one where nothing is changed."""
     kind = values["track"]
-    chosen = {name: values[name] for name in tracks.known[kind]}
-    if kind == tracks.kind and chosen == tracks.known[kind]:
+    values_of_track = {name: values[name] for name in tracks.known[kind]}
+    if kind == tracks.kind and values_of_track == tracks.known[kind]:
         return tracks.given
     if kind == ORBIT:
         given = tracks.given if kind == tracks.kind else {}
-        angles = {name: float(np.radians(v)) for name, v in chosen.items() if name != "height"}
-        return {**given, "height": chosen["height"], **angles}
+        angles = {
+            name: float(np.radians(v)) for name, v in values_of_track.items() if name != "height"
+        }
+        return {**given, "height": values_of_track["height"], **angles}
     if kind == STRAIGHT:
-        return {end: [chosen[f"{end}_{axis}"] for axis in LOCAL] for end in ENDS}
+        return {end: [values_of_track[f"{end}_{axis}"] for axis in LOCAL] for end in ENDS}
     ends = {}
     for end in ENDS:
-        longitude, latitude, height = (chosen[f"{end}_{axis}"] for axis in GEODETIC)
+        longitude, latitude, height = (values_of_track[f"{end}_{axis}"] for axis in GEODETIC)
         place = np.radians(longitude), np.radians(latitude), height
         ends[end] = np.array([float(v) for v in earth_fixed(tracks.earth, place)])
     return {**ends, "centre": np.zeros(3)}
@@ -139,11 +150,11 @@ def _values(ends: list[Place], axes: Mapping[str, str], places: int = 12) -> dic
 
 def _geodetic_ends(ends: list[Place], earth: Ellipsoid, places: int) -> dict[str, float]:
     """Longitude, latitude (degrees) and height of Earth-fixed positions."""
-    found = []
+    geodetic_ends = []
     for place in ends:
         longitude, latitude, height = (float(v) for v in geodetic(earth, tuple(place)))
-        found.append(np.array([np.degrees(longitude), np.degrees(latitude), height]))
-    return _values(found, GEODETIC, places)
+        geodetic_ends.append(np.array([np.degrees(longitude), np.degrees(latitude), height]))
+    return _values(geodetic_ends, GEODETIC, places)
 
 
 def _reach(values: Mapping[str, float], kind: str) -> dict[str, float]:

@@ -51,8 +51,8 @@ def number(given: Given, key: str, default: float, low: float = -math.inf) -> fl
     value = given.get(key, default)
     fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     if not fits or value < low:
-        least = "" if low == -math.inf else f" of at least {low:g}"
-        raise InputError(f"{key} must be a finite number{least}, but is {show(value)}")
+        minimum_in_words = "" if low == -math.inf else f" of at least {low:g}"
+        raise InputError(f"{key} must be a finite number{minimum_in_words}, but is {show(value)}")
     return float(value)
 
 
@@ -76,11 +76,11 @@ def word(given: Given, key: str, default: str, words: Iterable[str]) -> str:
     return value
 
 
-def check_keys(given: Given, known: Iterable[str]) -> None:
+def check_keys(given: Given, known_keys: Iterable[str]) -> None:
     """Refuse values of unknown controls.
 
     **Raises:** `InputError`."""
-    known = tuple(known)
+    known_keys = tuple(known_keys)
     for key in given:
-        if key not in known:
-            raise InputError(f"there is no value {show(key)}{did_you_mean(str(key), known)}")
+        if key not in known_keys:
+            raise InputError(f"there is no value {show(key)}{did_you_mean(str(key), known_keys)}")

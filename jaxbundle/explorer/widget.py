@@ -25,18 +25,18 @@ def show(view: ExplorerView, *, height: int = 800) -> Any:
     height = integer("height", height, 200, 4000)
     page = page_file(view, {}, live=True).content.decode()
     widget = _widget_class()(page=page, height=height)
-    widget.on_msg(lambda one, content, _: one.send(*reply(view, content)))
+    widget.on_msg(lambda sender, content, _: sender.send(*reply(view, content)))
     return widget
 
 
-def reply(view: ExplorerView, asked: Any) -> tuple[dict[str, Any], list[bytes]]:
+def reply(view: ExplorerView, message: Any) -> tuple[dict[str, Any], list[bytes]]:
     """The answer to a message of the page (`number`, `action`, `given`), and its content."""
-    number = asked.get("number") if isinstance(asked, dict) else None
+    number = message.get("number") if isinstance(message, dict) else None
     try:
-        given = asked["given"]
+        given = message["given"]
         if not isinstance(given, dict):
             raise InputError("expected values by name")
-        file = respond(view, str(asked["action"]), given)
+        file = respond(view, str(message["action"]), given)
     except (InputError, NotSolvedError, Refused) as error:
         return {"number": number, "error": str(error)}, []
     except Exception as error:  # A program fault: shown on the page, the notebook continues.

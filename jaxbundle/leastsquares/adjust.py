@@ -264,7 +264,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     determined after robust estimation, snooping or variance components.
     """
     one_of("method", method, METHODS)
-    one_of("robust", robust, ESTIMATORS, none=True)
+    one_of("robust", robust, ESTIMATORS, allow_none=True)
     truth("estimate_components", estimate_components)
     check_test(snooping, significance)
     steps = integer("max_iterations", max_iterations) + 1

@@ -136,7 +136,7 @@ def make_problem(
     reduced system, "dense", "banded" or "iterative"; by default chosen by size and fill.
     `planning`: sizes at which the plan changes its form."""
     require_x64()
-    one_of("reduction", reduction, REDUCTIONS, none=True)
+    one_of("reduction", reduction, REDUCTIONS, allow_none=True)
     tables = tuple(tables)
     observations = tuple(observation_set.resolve_labels(tables) for observation_set in observations)
     observations = distinct_names(observations)

@@ -167,12 +167,14 @@ def _check_millimetres(
         )
 
 
-def _check_lengths(heights: Mapping[str, float | None], others: Mapping[str, float | None]) -> None:
+def _check_lengths(
+    heights: Mapping[str, float | None], other_lengths: Mapping[str, float | None]
+) -> None:
     """Refuse lengths that are not positive, and another number of heights than one.
 
     **Raises:** `InputError`."""
     if sum(value is not None for value in heights.values()) != 1:
         raise InputError(f"give one of {', '.join(heights)}")
-    for name, value in {**others, **heights}.items():
+    for name, value in {**other_lengths, **heights}.items():
         if value is not None and not (math.isfinite(value) and value > 0):
             raise InputError(f"{name} is {value}; it must be positive")

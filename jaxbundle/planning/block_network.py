@@ -43,8 +43,8 @@ def planned_network(
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     heights = np.random.default_rng(seed).uniform(-1, 1, len(grid)) * relief * design.height
     targets = np.concatenate([grid, heights[:, None]], axis=1)
-    along, across = (_control(n, control_every) for n in counts)
-    control = [row * columns + column for row in across for column in along]
+    control_along, control_across = (_control(n, control_every) for n in counts)
+    control = [row * columns + column for row in control_across for column in control_along]
     stations = aerial_block(
         design.strips,
         design.photographs_per_strip,

@@ -114,18 +114,18 @@ def camera_rays(camera: Camera) -> Float[np.ndarray, "rows columns 3"]:
         origin, step = pixel_frame(model, camera.image_size, camera.pixel_size)
     except ValueError as error:
         raise InputError(f"camera {camera.id}: {error}") from None
-    given = {**default_parameters(model), **camera.parameters}
-    parameters = tuple(float(given.get(name, 0.0)) for name in model.parameters)
+    values = {**default_parameters(model), **camera.parameters}
+    parameters = tuple(float(values.get(name, 0.0)) for name in model.parameters)
     v, u = np.indices((rows + 1, columns + 1)).reshape(2, -1)
     x, y = ((a - o) / s for a, o, s in zip((u, v), origin, step))
     out = np.empty((len(x), 3))
     # In batches of one size: one program for all sizes of photographs. Larger ones make small
     # photographs compute rays that are not used, smaller ones cost calls.
     batch = 1 << 16
-    for first in range(0, len(x), batch):
-        chosen = np.minimum(np.arange(first, first + batch), len(x) - 1)
-        ray = np.stack(_rays(model, parameters, x[chosen], y[chosen]), -1)
-        out[first : first + batch] = ray[: len(x) - first]
+    for begin in range(0, len(x), batch):
+        pixels_of_batch = np.minimum(np.arange(begin, begin + batch), len(x) - 1)
+        ray = np.stack(_rays(model, parameters, x[pixels_of_batch], y[pixels_of_batch]), -1)
+        out[begin : begin + batch] = ray[: len(x) - begin]
     return out.reshape(rows + 1, columns + 1, 3)
 
 
@@ -163,9 +163,9 @@ def first_hits(
 ) -> tuple[Float[np.ndarray, "rows columns"], Int[np.ndarray, "rows columns"]]:
     """Lengths of rays to the first surface, inf where there is none, and which one it is."""
     t = np.stack([shape.distances(o, d) for shape in scene.shapes])
-    first = np.argmin(t, axis=0)
+    nearest_surface = np.argmin(t, axis=0)
     nearest = np.min(t, axis=0)
-    return nearest, np.where(np.isfinite(nearest), first, -1)
+    return nearest, np.where(np.isfinite(nearest), nearest_surface, -1)
 
 
 def visible(
@@ -205,27 +205,29 @@ def _render_strip(
     Int[np.ndarray, "high columns"],
 ]:
     """Grey values without noise, points and surfaces of some rows."""
-    along = d[1:, :-1] - d[:-1, :-1], d[:-1, 1:] - d[:-1, :-1]
-    moved = o[1:, :-1] - o[:-1, :-1], o[:-1, 1:] - o[:-1, :-1]
+    changes_of_direction = d[1:, :-1] - d[:-1, :-1], d[:-1, 1:] - d[:-1, :-1]
+    changes_of_origin = o[1:, :-1] - o[:-1, :-1], o[:-1, 1:] - o[:-1, :-1]
     o, d = o[:-1, :-1], d[:-1, :-1]
-    ray = np.all(np.isfinite(d + along[0] + along[1]), axis=-1)
+    ray = np.all(np.isfinite(d + changes_of_direction[0] + changes_of_direction[1]), axis=-1)
     t, surface = first_hits(scene, o, np.where(ray[..., None], d, NO_RAY))
     t, surface = np.where(ray, t, np.inf), np.where(ray, surface, -1)
     point = o + np.where(np.isfinite(t), t, np.nan)[..., None] * d
     grey = np.full(t.shape, float(sensor.background), np.float32)
     for k, (shape, texture) in enumerate(zip(scene.shapes, scene.textures)):
-        chosen = surface == k
-        if chosen.any():
-            length, X, ray = t[chosen], point[chosen], _first(d, chosen)
+        is_of_surface = surface == k
+        if is_of_surface.any():
+            length, X, ray = t[is_of_surface], point[is_of_surface], _first(d, is_of_surface)
             # Slopes by differences over 1e-6 of the distance, a thousandth of a pixel: below the
             # root of rounding (1e-8 of the coordinates) they would be noise.
             tangent = shape.axes(X, 1e-6 * np.median(length))
             steps = [
-                _on_the_tangent_plane(tangent, length, ray, _first(b, chosen), _first(a, chosen))
-                for a, b in zip(along, moved)
+                _on_the_tangent_plane(
+                    tangent, length, ray, _first(b, is_of_surface), _first(a, is_of_surface)
+                )
+                for a, b in zip(changes_of_direction, changes_of_origin)
             ]
             value = _mean_of_a_pixel(shape, texture, X, steps, sensor.fine)
-            grey[chosen] = sensor.offset + 255 * sensor.gain * value
+            grey[is_of_surface] = sensor.offset + 255 * sensor.gain * value
     return grey, point, surface
 
 
@@ -240,18 +242,22 @@ def _on_the_tangent_plane(
     tangent: TangentPlane,
     t: Float[np.ndarray, " n"],
     d: Float[np.ndarray, "3 n"],
-    moved: Float[np.ndarray, "3 n"],
+    change_of_origin: Float[np.ndarray, "3 n"],
     turned: Float[np.ndarray, "3 n"],
 ) -> Float[np.ndarray, "2 n"]:
     """How the texture's coordinates change to the next pixel, two arrays [n]: the next ray, whose
     origin is moved and whose direction is turned, meets the tangent plane (Igehy, 1999, eq. 10)."""
     normal, axes = tangent
-    shift = moved + t * turned
+    shift = change_of_origin + t * turned
     d = d + turned
-    across = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
-    across = np.where(np.abs(across) < 1e-9, 1e-9, across)  # a ray along the surface
-    back = (normal[0] * shift[0] + normal[1] * shift[1] + normal[2] * shift[2]) / across
-    return axes @ (shift - back * d)
+    along_normal = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
+    along_normal = np.where(
+        np.abs(along_normal) < 1e-9, 1e-9, along_normal
+    )  # a ray along the surface
+    depth_shift = (
+        normal[0] * shift[0] + normal[1] * shift[1] + normal[2] * shift[2]
+    ) / along_normal
+    return axes @ (shift - depth_shift * d)
 
 
 def _mean_of_a_pixel(
@@ -263,12 +269,12 @@ def _mean_of_a_pixel(
 ) -> Float[np.ndarray, " n"]:
     """The mean of `fine` × `fine` samples over the parallelogram of a pixel; `steps`: its sides."""
     s, t = shape.coordinates(X)
-    down, right = steps
-    width = np.maximum(np.hypot(*down), np.hypot(*right)) / fine
+    step_down, step_right = steps
+    width = np.maximum(np.hypot(*step_down), np.hypot(*step_right)) / fine
     offsets = (np.arange(fine) + 0.5) / fine - 0.5
     total = np.zeros(len(s))
     for a in offsets:
         for b in offsets:
-            shift = a * down + b * right
+            shift = a * step_down + b * step_right
             total += texture(s + shift[0], t + shift[1], width)
     return total / fine**2

@@ -87,8 +87,11 @@ class HeightField:
         """Normals of points, coordinates first, and the directions of the texture's coordinates;
         slopes are taken over `size`."""
         x, y = X[..., 0], X[..., 1]
-        here = self.height(x, y)
-        slopes = (self.height(x + size, y) - here) / size, (self.height(x, y + size) - here) / size
+        height_here = self.height(x, y)
+        slopes = (
+            (self.height(x + size, y) - height_here) / size,
+            (self.height(x, y + size) - height_here) / size,
+        )
         return (-slopes[0], -slopes[1], 1.0), np.eye(3)[:2]
 
     def _block_starts(
@@ -100,13 +103,13 @@ class HeightField:
         """Lengths within which no ray of a block meets the surface, spread over its rays."""
         rows, columns = d.shape[:2]
         r, c = (np.minimum(np.arange(n) // side * side + side // 2, n - 1) for n in (rows, columns))
-        away = lambda a: np.linalg.norm(a - a[r[:, None], c[None]], axis=2)
-        first = lambda n: np.arange(0, n, side)
+        largest_distance = lambda a: np.linalg.norm(a - a[r[:, None], c[None]], axis=2)
+        first_rows = lambda n: np.arange(0, n, side)
         widest = lambda a: np.maximum.reduceat(
-            np.maximum.reduceat(a, first(rows), 0), first(columns), 1
+            np.maximum.reduceat(a, first_rows(rows), 0), first_rows(columns), 1
         )
         middle = lambda a: a[np.ix_(r[::side], c[::side])].reshape(-1, 3)
-        spread = lambda a: np.nan_to_num(widest(away(a)), nan=np.inf).ravel()
+        spread_of = lambda a: np.nan_to_num(widest(largest_distance(a)), nan=np.inf).ravel()
         # A ray at t is within |Δo| + |Δd|·t of the central one, which changes f by up to √(1 + L²)
         # times that.
         slack = np.hypot(1.0, not_none(self.steepest))
@@ -114,9 +117,9 @@ class HeightField:
             middle(o),
             middle(d),
             np.zeros(len(r[::side]) * len(c[::side])),
-            slack * spread(o),
-            slack * spread(d),
-            last=False,
+            slack * spread_of(o),
+            slack * spread_of(d),
+            is_last=False,
         )
         t = np.where(np.isfinite(t), t, 0.0).reshape(len(r[::side]), len(c[::side]))
         return t[np.arange(rows)[:, None] // side, np.arange(columns)[None] // side]
@@ -128,9 +131,9 @@ class HeightField:
         start: Float[np.ndarray, " n"],
         near: float | Float[np.ndarray, " n"],
         spread: float | Float[np.ndarray, " n"],
-        last: bool = True,
+        is_last: bool = True,
     ) -> Float[np.ndarray, " n"]:
-        """Lengths to where f − near − spread·t is about 0 (`last`: exactly); inf where a ray
+        """Lengths to where f − near − spread·t is about 0 (`is_last`: exactly); inf where a ray
         leaves the bounds."""
         low, high = not_none(self.bounds)
         relief = max(high - low, 1e-9 * (self.extent[2] - self.extent[0]))
@@ -147,16 +150,21 @@ class HeightField:
         # Then by secants, which need a start near the surface. Half, double and a tenth of 1e-3 of
         # the relief change 0.03 % of the rays, those that graze summits, and no time.
         t = self._march(o, d, t, np.flatnonzero(usable), ends, 1e-3 * relief)
-        if not last:
+        if not is_last:
             return t
-        found = self._settle(o, d, t)
-        lost = np.flatnonzero(np.isfinite(t) & ~np.isfinite(found))
-        if len(lost):  # a ray that grazes a summit, where secants diverge, goes on
-            t = self._march(o, d, t, lost, ends, SURFACE_TOLERANCE * relief)
+        settled = self._settle(o, d, t)
+        lost_rays = np.flatnonzero(np.isfinite(t) & ~np.isfinite(settled))
+        if len(lost_rays):  # a ray that grazes a summit, where secants diverge, goes on
+            t = self._march(o, d, t, lost_rays, ends, SURFACE_TOLERANCE * relief)
             with np.errstate(invalid="ignore"):
-                on = self._above(o[lost], d[lost], t[lost]) <= SURFACE_TOLERANCE * relief
-            found[lost] = self._inside(o[lost], d[lost], np.where(on, t[lost], np.inf))
-        return found
+                is_on_surface = (
+                    self._above(o[lost_rays], d[lost_rays], t[lost_rays])
+                    <= SURFACE_TOLERANCE * relief
+                )
+            settled[lost_rays] = self._inside(
+                o[lost_rays], d[lost_rays], np.where(is_on_surface, t[lost_rays], np.inf)
+            )
+        return settled
 
     def _march(
         self,
@@ -175,12 +183,12 @@ class HeightField:
         for _ in range(400):
             f = self._above(o[active], d[active], t[active])
             f = f - near[active] - spread[active] * t[active]
-            on = f > close
-            active, f = active[on], f[on]
+            is_away = f > close
+            active, f = active[is_away], f[is_away]
             t[active] += f / reach[active]
-            gone = t[active] > leave[active]
-            t[active[gone]] = np.inf
-            active = active[~gone]
+            is_beyond = t[active] > leave[active]
+            t[active[is_beyond]] = np.inf
+            active = active[~is_beyond]
             if not len(active):
                 break
         return t
@@ -189,25 +197,25 @@ class HeightField:
         self, o: Float[np.ndarray, "n 3"], d: Float[np.ndarray, "n 3"], t: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """By secants onto the surface; inf outside the extent."""
-        chosen = np.flatnonzero(np.isfinite(t))
-        o, d, here = o[chosen], d[chosen], t[chosen]
-        f = self._above(o, d, here)
+        rays_that_meet = np.flatnonzero(np.isfinite(t))
+        o, d, length_here = o[rays_that_meet], d[rays_that_meet], t[rays_that_meet]
+        f = self._above(o, d, length_here)
         with np.errstate(invalid="ignore", divide="ignore"):
             step = np.where(f == 0, 0.0, f / (np.abs(d[:, 2]) + 1e-12))
             # With 3 of them 0.2 % of the rays do not settle, with 6 or 24 fewer than 0.01 % differ.
             for _ in range(12):
-                other = here + step
-                g = self._above(o, d, other)
-                step = np.where(g == f, 0.0, -g * (other - here) / (g - f))
+                length_next = length_here + step
+                g = self._above(o, d, length_next)
+                step = np.where(g == f, 0.0, -g * (length_next - length_here) / (g - f))
                 step = np.where(np.isfinite(step), step, 0.0)
-                here, f = other, g
-                if (np.abs(f) <= SURFACE_TOLERANCE * here).all():
+                length_here, f = length_next, g
+                if (np.abs(f) <= SURFACE_TOLERANCE * length_here).all():
                     break
         # A thousand tolerances: secants that still creep are on the surface for any photograph;
         # those that diverged are far off.
-        good = (np.abs(f) <= 1e3 * SURFACE_TOLERANCE * here) & (here > 0)
+        good = (np.abs(f) <= 1e3 * SURFACE_TOLERANCE * length_here) & (length_here > 0)
         t = np.full(len(t), np.inf)
-        t[chosen] = self._inside(o, d, np.where(good, here, np.inf))
+        t[rays_that_meet] = self._inside(o, d, np.where(good, length_here, np.inf))
         return t
 
     def _inside(
@@ -254,8 +262,8 @@ class Rectangle:
             t = ((np.asarray(self.corner) - o) @ normal) / (d @ normal)
             s = self._from_corner(o + t[..., None] * d, axes)
             length = [np.linalg.norm(self.along), np.linalg.norm(self.across)]
-            inside = ((s >= 0) & (s <= length)).all(-1) & (t > 0)
-        return np.where(inside, t, np.inf)
+            is_inside = ((s >= 0) & (s <= length)).all(-1) & (t > 0)
+        return np.where(is_inside, t, np.inf)
 
     def coordinates(
         self, X: Float[np.ndarray, "*n 3"]

@@ -172,17 +172,17 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
 
     rng = np.random.default_rng(seed)
     rays = _project_all(stations, targets, cameras, of_station, image_format)
-    chosen = np.ones(len(rays[0]), bool)
+    is_chosen = np.ones(len(rays[0]), bool)
     if max_incidence is not None:
-        chosen = _facing(stations, targets, normals, *rays[:2]) >= np.cos(max_incidence)
+        is_chosen = _facing(stations, targets, normals, *rays[:2]) >= np.cos(max_incidence)
     if max_rays is not None:
-        chosen[chosen] = _draw_rays(rays[1][chosen], max_rays, rng)
+        is_chosen[is_chosen] = _draw_rays(rays[1][is_chosen], max_rays, rng)
     # A control point is known: one ray is information about its image. Others need two.
     need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
-    (image, point, xy), used = _select_imaged(rays, chosen, need)
-    row = np.cumsum(used) - 1
-    points = _points(targets, role, used, control_sigma)
-    ends = _ends(distances, len(targets), used, row)
+    (image, point, xy), is_used = _select_imaged(rays, is_chosen, need)
+    row = np.cumsum(is_used) - 1
+    points = _points(targets, role, is_used, control_sigma)
+    ends = _ends(distances, len(targets), is_used, row)
     observations = Observations(
         image,
         row[point],
@@ -219,34 +219,34 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
 
 
 def _select_imaged(
-    rays: Rays, chosen: Bool[np.ndarray, " rays"], need: Int[np.ndarray, " targets"]
+    rays: Rays, is_chosen: Bool[np.ndarray, " rays"], need: Int[np.ndarray, " targets"]
 ) -> tuple[list[np.ndarray], Bool[np.ndarray, " targets"]]:
     """The rays of targets with enough rays, and these targets.
 
     **Raises:** `InputError` where there are none."""
-    used = np.bincount(rays[1][chosen], minlength=len(need)) >= need
-    chosen = chosen & used[rays[1]]
-    if not chosen.any():
+    is_used = np.bincount(rays[1][is_chosen], minlength=len(need)) >= need
+    is_chosen = is_chosen & is_used[rays[1]]
+    if not is_chosen.any():
         raise InputError(
             "no target is imaged often enough; check the format, the units, and where the "
             "stations look"
         )
-    return [x[chosen] for x in rays], used
+    return [x[is_chosen] for x in rays], is_used
 
 
 def _points(
     targets: Float[np.ndarray, "targets 3"],
     role: np.ndarray,
-    used: Bool[np.ndarray, " targets"],
+    is_used: Bool[np.ndarray, " targets"],
     control_sigma: float | Sequence[float],
 ) -> Points:
-    role, number = role[used], np.flatnonzero(used) + 1
+    role, number = role[is_used], np.flatnonzero(is_used) + 1
     sigma = np.full((len(role), 3), np.nan)
     if "control" in role:
         sigma[role == "control"] = np.broadcast_to(control_sigma, 3)
     source = Source("targets", number, "target")
     return Points(
-        tuple(map(str, number.tolist())), tuple(role.tolist()), targets[used], sigma, source
+        tuple(map(str, number.tolist())), tuple(role.tolist()), targets[is_used], sigma, source
     )
 
 
@@ -277,16 +277,16 @@ def _measure(
 
 
 def _camera_of_station(
-    cameras: Sequence[Camera], given: Sequence[int] | None, stations: int
+    cameras: Sequence[Camera], indices_given: Sequence[int] | None, stations: int
 ) -> Int[np.ndarray, " images"]:
-    if given is None:
+    if indices_given is None:
         if len(cameras) not in (1, stations):
             raise InputError(
                 f"{len(cameras)} cameras for {stations} stations; give camera_of_station, the "
                 "index of the camera of every station"
             )
         return np.arange(stations) % len(cameras)
-    indices = numeric_array("camera_of_station", given, "indices of cameras")
+    indices = numeric_array("camera_of_station", indices_given, "indices of cameras")
     if indices.shape != (stations,) or not np.isin(indices, np.arange(len(cameras))).all():
         raise InputError(
             f"camera_of_station must be {stations} indices below {len(cameras)}, one for each "
@@ -306,18 +306,18 @@ def _roles(
     sigma = _not_negative(control_sigma, 3, "control_sigma")
     if (sigma == 0).any() and (sigma > 0).any():
         raise InputError("control_sigma: 0 (fixed) must be given for all three axes or for none")
-    for name, chosen, word in (
+    for name, indices, word in (
         ("control", control, "fixed" if (sigma == 0).all() else "control"),
         ("check", check, "check"),
     ):
-        chosen = _indices(name, chosen)
-        if chosen.ndim != 1:
-            raise InputError(f"{name} must be a list of indices, but is {show(chosen.tolist())}")
-        if not np.isin(chosen, np.arange(points)).all():
+        indices = _indices(name, indices)
+        if indices.ndim != 1:
+            raise InputError(f"{name} must be a list of indices, but is {show(indices.tolist())}")
+        if not np.isin(indices, np.arange(points)).all():
             raise InputError(f"{name} holds an index that is not among the {points} targets")
-        if (role[chosen] != "tie").any():
+        if (role[indices] != "tie").any():
             raise InputError("a target cannot be a control point and a check point at once")
-        role[chosen] = word
+        role[indices] = word
     return role
 
 
@@ -354,7 +354,7 @@ def _disturbance(
 def _ends(
     distances: Sequence[tuple[int, int]],
     targets: int,
-    used: Bool[np.ndarray, " targets"],
+    is_used: Bool[np.ndarray, " targets"],
     row: Int[np.ndarray, " targets"],
 ) -> Int[np.ndarray, "n 2"]:
     """The ends of the distances as rows of the points used."""
@@ -369,7 +369,7 @@ def _ends(
     ends = ends.reshape(-1, 2)
     if not np.isin(ends, np.arange(targets)).all():
         raise InputError(f"distances name an index that is not among the {targets} targets")
-    for a, b in ends[~used[ends].all(1)][:1]:
+    for a, b in ends[~is_used[ends].all(1)][:1]:
         raise InputError(f"the distance from target {a + 1} to {b + 1}: too few images show it")
     return row[ends]
 
@@ -409,9 +409,9 @@ def _draw_rays(
     """A mask that keeps at most this number of rays per point, drawn at random."""
     order = np.lexsort((rng.random(len(point)), point))
     sorted_point = point[order]
-    first = np.searchsorted(sorted_point, sorted_point)
+    first_place = np.searchsorted(sorted_point, sorted_point)
     keep = np.empty(len(point), bool)
-    keep[order] = np.arange(len(point)) - first < max_rays
+    keep[order] = np.arange(len(point)) - first_place < max_rays
     return keep
 
 
@@ -425,7 +425,7 @@ def _project_all(
     """All images of targets inside the format: image, point [rays], true coordinates [rays, 2]."""
     # Small networks are padded to 16 stations and 128 targets, larger ones to round numbers, so
     # that they share programs: compiling takes longer than projecting a million rays.
-    found, number = [], len(targets)
+    batches, number = [], len(targets)
     wide = max(128, round_up(number))
     targets = np.pad(targets, [(0, wide - number), (0, 0)], mode="edge")
     for c, camera in enumerate(cameras):
@@ -439,15 +439,15 @@ def _project_all(
         for begin in range(0, len(index), at_once):
             # The last batch is padded, so that all have one shape and compile once.
             batch = np.resize(index[begin : begin + at_once], at_once)
-            xy, back = _images_of(
+            xy, is_invertible = _images_of(
                 model, p, stations.position[batch], stations.angles[batch], targets
             )
-            xy, back = np.asarray(xy)[:, :number], np.asarray(back)[:, :number]
-            inside = ((xy >= low) & (xy <= high)).all(-1) & back
-            inside[len(index) - begin :] = False
-            i, k = np.nonzero(inside)
-            found.append((batch[i], k, xy[i, k]))
-    image, point, xy = (np.concatenate(columns) for columns in zip(*found))
+            xy, is_invertible = np.asarray(xy)[:, :number], np.asarray(is_invertible)[:, :number]
+            is_inside = ((xy >= low) & (xy <= high)).all(-1) & is_invertible
+            is_inside[len(index) - begin :] = False
+            i, k = np.nonzero(is_inside)
+            batches.append((batch[i], k, xy[i, k]))
+    image, point, xy = (np.concatenate(columns) for columns in zip(*batches))
     order = np.lexsort((point, image))
     return image[order], point[order], xy[order]
 

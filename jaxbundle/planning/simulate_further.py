@@ -44,30 +44,38 @@ def simulate_further(
     """
     require_x64()
     random = np.random.default_rng(integer("seed", seed, least=0, most=LARGEST_SEED))
-    known: set[str] = set()
-    made = []
+    known_tables: set[str] = set()
+    simulated = []
     for rows in require_network(network).further:
         field = rows.MEASURED
         declared = declare(truth.replace(further=(rows,)), np.zeros(3))
         # The network declares its tables for these rows alone: theirs are what `unknowns` may name.
         values = {t.name: t.value for t in declared.tables}
-        known |= set(values)
+        known_tables |= set(values)
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}
         if rows.CHANGES_IMAGE_POINTS:
             shift = _image_points(truth, rows, values) - truth.observations.xy
             network = _shift(network, truth, shift)
         if field:
             rows = rows.among(truth)
-            seen = next(o for o in declared.observations if o.name in declared.further_sets)
-            measured = jax.tree.leaves(seen.measured)[0] + _residuals(declared.tables, seen, values)
-            whitening = seen.weight(np.shape(measured)[-1] if np.ndim(measured) > 1 else 1)
+            observation_set = next(
+                o for o in declared.observations if o.name in declared.further_sets
+            )
+            measured = jax.tree.leaves(observation_set.measured)[0] + _residuals(
+                declared.tables, observation_set, values
+            )
+            whitening = observation_set.weight(
+                np.shape(measured)[-1] if np.ndim(measured) > 1 else 1
+            )
             noise = _noise(random, whitening).reshape(np.shape(measured))
             rows = dataclasses.replace(rows, **{field: measured + noise})
-        made.append(rows)
+        simulated.append(rows)
     for name in unknowns or {}:
-        if name not in known:
-            raise InputError(f"unknowns: there is no table {name!r}; known: {', '.join(known)}")
-    return network.replace(further=tuple(made))
+        if name not in known_tables:
+            raise InputError(
+                f"unknowns: there is no table {name!r}; known: {', '.join(known_tables)}"
+            )
+    return network.replace(further=tuple(simulated))
 
 
 def _image_points(
@@ -83,9 +91,11 @@ def _image_points(
         declared, rays = declare(truth, np.zeros(3)), truth.observations
         values = {t.name: t.value for t in declared.tables} | values
         xy = rays.xy.copy()
-        for seen in declared.observations:
-            if seen.name in declared.image_rows:
-                xy[declared.image_rows[seen.name]] += _residuals(declared.tables, seen, values)
+        for observation_set in declared.observations:
+            if observation_set.name in declared.image_rows:
+                xy[declared.image_rows[observation_set.name]] += _residuals(
+                    declared.tables, observation_set, values
+                )
         change = np.abs(xy - rays.xy).max(initial=0.0)
         truth = truth.replace(observations=dataclasses.replace(rays, xy=xy))
         if change <= 1e-13 * np.abs(xy).max(initial=0.0):
@@ -96,35 +106,39 @@ def _image_points(
 
 
 def _shift(network: Network, truth: Network, shift: Float[np.ndarray, "rays 2"]) -> Network:
-    rays, others = network.observations, truth.observations
-    same = len(rays) == len(others) and (rays.image == others.image).all()
-    if not (same and (rays.point == others.point).all()):
+    rays, true_rays = network.observations, truth.observations
+    is_same = len(rays) == len(true_rays) and (rays.image == true_rays.image).all()
+    if not (is_same and (rays.point == true_rays.point).all()):
         raise InputError("simulate_further: network and truth have other image points")
     return network.replace(observations=dataclasses.replace(rays, xy=rays.xy + shift))
 
 
 def _residuals(
-    tables: Sequence[Table], seen: ObservationSet, values: Mapping[str, PyTree]
+    tables: Sequence[Table], observation_set: ObservationSet, values: Mapping[str, PyTree]
 ) -> Float[np.ndarray, "n *residuals"]:
     """Computed minus measured of all observations of a set."""
-    spaces = [next(t.space for t in tables if t.name == name) for name in seen.kind.of]
-    touched = [
+    spaces = [next(t.space for t in tables if t.name == name) for name in observation_set.kind.of]
+    touched_values = [
         jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], values[name])
-        for name, rows in zip(seen.kind.of, seen.rows)
+        for name, rows in zip(observation_set.kind.of, observation_set.rows)
     ]
-    found = np.asarray(_evaluate(seen.kind, tuple(spaces), touched, seen.measured))
-    return found.reshape(np.shape(jax.tree.leaves(seen.measured)[0]))
+    residual_values = np.asarray(
+        _evaluate(observation_set.kind, tuple(spaces), touched_values, observation_set.measured)
+    )
+    return residual_values.reshape(np.shape(jax.tree.leaves(observation_set.measured)[0]))
 
 
 @partial(compile_once, static=(0, 1))
 def _evaluate(
-    kind: Kind, spaces: tuple[Space, ...], touched: Sequence[PyTree], measured: PyTree
+    kind: Kind, spaces: tuple[Space, ...], touched_values: Sequence[PyTree], measured: PyTree
 ) -> Float[Array, "n residuals"]:
-    def residuals_of(touched: Sequence[PyTree], measured: PyTree) -> Float[Array, " residuals"]:
-        blocks = [space.prepare(value) for space, value in zip(spaces, touched)]
+    def residuals_of(
+        touched_values: Sequence[PyTree], measured: PyTree
+    ) -> Float[Array, " residuals"]:
+        blocks = [space.prepare(value) for space, value in zip(spaces, touched_values)]
         return jnp.stack(evaluate(kind, blocks, measured))
 
-    return jax.vmap(residuals_of)(touched, scalars(measured))
+    return jax.vmap(residuals_of)(touched_values, scalars(measured))
 
 
 def _noise(

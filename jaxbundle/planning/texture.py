@@ -63,8 +63,8 @@ class Texture:
         # Batches of 2¹² to 2¹⁷ samples, whose arrays stay in the cache, take the same time; a
         # million at once takes twice as long.
         batch = 1 << 15
-        for first in range(0, len(s), batch):
-            part = slice(first, first + batch)
+        for begin in range(0, len(s), batch):
+            part = slice(begin, begin + batch)
             out[part] = self._grey(s[part], t[part], width[part])
         return out
 
@@ -137,11 +137,13 @@ def _interpolate(
     total = np.zeros(len(x))
     for k in range(low.min(), min(low.max() + 1, len(pyramid) - 1) + 1):
         share = 1 - np.abs(level - k)
-        chosen = np.flatnonzero(share > 0)
-        whole_chunk = len(chosen) == len(x)
-        at = slice(None) if whole_chunk else chosen
+        rows_of_level = np.flatnonzero(share > 0)
+        whole_chunk = len(rows_of_level) == len(x)
+        rows = slice(None) if whole_chunk else rows_of_level
         size = 0.5**k
-        total[at] += share[at] * _bilinear(pyramid[k], x[at] * size - 0.5, y[at] * size - 0.5)
+        total[rows] += share[rows] * _bilinear(
+            pyramid[k], x[rows] * size - 0.5, y[rows] * size - 0.5
+        )
     return total
 
 
@@ -155,10 +157,10 @@ def _bilinear(
     column, row = np.floor(x), np.floor(y)
     fx, fy = (x - column).astype(np.float32), (y - row).astype(np.float32)
     column, row = column.astype(np.int64) & (side - 1), row.astype(np.int64) & (side - 1)
-    right, below = (column + 1) & (side - 1), ((row + 1) & (side - 1)) * side
+    next_column, next_row = (column + 1) & (side - 1), ((row + 1) & (side - 1)) * side
     row, flat = row * side, tile.ravel()
     upper = flat[row + column]
-    upper += (flat[row + right] - upper) * fx
-    lower = flat[below + column]
-    lower += (flat[below + right] - lower) * fx
+    upper += (flat[row + next_column] - upper) * fx
+    lower = flat[next_row + column]
+    lower += (flat[next_row + next_column] - lower) * fx
     return upper + (lower - upper) * fy

@@ -62,10 +62,10 @@ def difference_map(
     ax = axes(ax, (7.5, 6))
     factor, unit = micrometres(comparison.unit)
     _draw_map(ax, comparison, factor * comparison.length, f"length of the difference [{unit}]")
-    every = np.s_[::2, ::2]
-    known = np.isfinite(comparison.length[every])
-    x, y = (grid[every][known] for grid in np.meshgrid(comparison.x, comparison.y))
-    u, v = np.moveaxis(factor * comparison.difference[every][known], -1, 0)
+    every_second = np.s_[::2, ::2]
+    is_known = np.isfinite(comparison.length[every_second])
+    x, y = (grid[every_second][is_known] for grid in np.meshgrid(comparison.x, comparison.y))
+    u, v = np.moveaxis(factor * comparison.difference[every_second][is_known], -1, 0)
     key = round_number(factor * comparison.largest) or 1.0
     arrows = ax.quiver(
         x, y, u, v, angles="xy", color="white", scale=12 * key, scale_units="width", width=0.002
@@ -73,8 +73,8 @@ def difference_map(
     ax.quiverkey(
         arrows, 0.9, 1.02, key, f"{key:g} {unit}", labelpos="E", color=INK, coordinates="axes"
     )
-    removed = ", rotation removed" if comparison.rotation.any() else ""
-    title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}{removed}")
+    rotation_note = ", rotation removed" if comparison.rotation.any() else ""
+    title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}{rotation_note}")
     return ax
 
 
@@ -118,6 +118,6 @@ def difference_maps(
         return difference_map(comparison, ax)
     figure = ax.figure
     ax.remove()  # its place goes to the two
-    left, right = figure.subplots(1, 2)
-    difference_map(comparison, left)
-    return expected_map(comparison, covariance, right)
+    left_axes, right_axes = figure.subplots(1, 2)
+    difference_map(comparison, left_axes)
+    return expected_map(comparison, covariance, right_axes)

@@ -43,32 +43,32 @@ def distortion_curve(adjustment: "Adjustment", camera: str, ax: "Axes | None" = 
     ax = axes(ax, (6.5, 4.2))
     adjustment.camera_parameters(camera)  # refuses an unknown camera
     measured, reach = curve_reach(adjustment, camera)
-    found = distortion_profile(adjustment, camera, reach=reach)
-    scale, unit = micrometres(found.unit)
+    profile = distortion_profile(adjustment, camera, reach=reach)
+    scale, unit = micrometres(profile.unit)
     for value, sigma, colour, name in (
-        (found.radial, found.radial_sigma, BLUE, "symmetric radial"),
-        (found.decentring, found.decentring_sigma, RUST, "decentring"),
+        (profile.radial, profile.radial_sigma, BLUE, "symmetric radial"),
+        (profile.decentring, profile.decentring_sigma, RUST, "decentring"),
     ):
         if not (np.abs(value) > 0).any() and not (sigma > 0).any() and colour == RUST:
             continue  # a model without decentring
         low, high = scale * (value - sigma), scale * (value + sigma)
         if (sigma > 0).any():
             name += f", σ up to {scale * np.nanmax(sigma):.2g} {unit}"
-        ax.fill_between(found.radius, low, high, color=colour, alpha=0.2, linewidth=0, zorder=2)
-        ax.plot(found.radius, scale * value, color=colour, linewidth=1.5, label=name, zorder=3)
+        ax.fill_between(profile.radius, low, high, color=colour, alpha=0.2, linewidth=0, zorder=2)
+        ax.plot(profile.radius, scale * value, color=colour, linewidth=1.5, label=name, zorder=3)
     ax.axhline(0, color=INK, linewidth=0.6, zorder=1)
     if reach > measured:
         ax.axvline(measured, color=GREY, linewidth=0.9, linestyle=":", label="farthest measurement")
     quiet(ax)
-    ax.set_xlim(0, found.radius[-1] or 1.0)
+    ax.set_xlim(0, profile.radius[-1] or 1.0)
     bottom, top = ax.get_ylim()
     # Rounding, far below 0.1 µm or px, must not look like distortion.
     ax.set_ylim(min(bottom, -0.1), max(top, 0.1))
-    label(ax, "x", "distance from the principal point", found.unit)
+    label(ax, "x", "distance from the principal point", profile.unit)
     label(ax, "y", "distortion, measured − ideal", unit)
     model = adjustment.cameras[camera]["model"]
-    known = np.nanmax(found.radial_sigma, initial=0) > 0
-    band = "without σ" if not known else "bands: ±σ (a posteriori)"
+    has_sigma = np.nanmax(profile.radial_sigma, initial=0) > 0
+    band = "without σ" if not has_sigma else "bands: ±σ (a posteriori)"
     title(ax, f"Camera {camera}: distortion ({model})", band)
     legend(ax)
     return ax
@@ -77,9 +77,9 @@ def distortion_curve(adjustment: "Adjustment", camera: str, ax: "Axes | None" = 
 def curve_reach(adjustment: "Adjustment", camera: str) -> tuple[float, float]:
     """Radii of the farthest measurement of a camera and, where the size of the image is known, of
     its farthest corner, if that is farther; in the unit of the model."""
-    low, high, known = image_frame(adjustment, camera)
+    low, high, is_known = image_frame(adjustment, camera)
     measured = farthest_measurement(adjustment, camera)
-    if not known:
+    if not is_known:
         return measured, measured
     centre = principal_point(adjustment, camera)
     return measured, max(measured, float(np.hypot(*np.maximum(high - centre, centre - low))))
@@ -107,7 +107,7 @@ def correlation_matrix(
         which = "no camera" if camera is None else f"camera {camera!r}: nothing"
         raise ValueError(f"{which} is free: there are no correlations to show")
     ax = axes(ax, correlation_size(n))
-    shown = ax.imshow(100 * C, cmap="RdBu_r", vmin=-100, vmax=100)
+    image = ax.imshow(100 * C, cmap="RdBu_r", vmin=-100, vmax=100)
     ax.set_xticks(range(n), names, rotation=90 if n > 8 or camera is None else 0, parse_math=False)
     ax.set_yticks(range(n), names, parse_math=False)
     quiet(ax, grid=False)
@@ -118,7 +118,7 @@ def correlation_matrix(
                 colour = "white" if abs(C[i, j]) > 0.6 else INK
                 text = f"{round(100 * C[i, j])}" if np.isfinite(C[i, j]) else "–"
                 ax.text(j, i, text, ha="center", va="center", fontsize=7, color=colour)
-    bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02)
+    bar = ax.figure.colorbar(image, ax=ax, shrink=0.8, pad=0.02)
     bar.set_label("correlation [%]", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=8, width=0.8, length=3)
     bar.outline.set_visible(False)
@@ -139,9 +139,9 @@ def _correlations(
     if camera is not None:
         adjustment.camera_parameters(camera)
         return tables[camera]["free"], tables[camera]["correlations"]
-    wanted = [(name, p) for name, entry in tables.items() for p in entry["free"]]
-    if not wanted:
+    free_parameters = [(name, p) for name, entry in tables.items() for p in entry["free"]]
+    if not free_parameters:
         return [], np.zeros((0, 0))
-    Q = adjustment.covariance(*(("camera", name, p) for name, p in wanted))
+    Q = adjustment.covariance(*(("camera", name, p) for name, p in free_parameters))
     sigma = np.sqrt(np.diagonal(Q))
-    return [f"{name}: {p}" for name, p in wanted], Q / np.outer(sigma, sigma)
+    return [f"{name}: {p}" for name, p in free_parameters], Q / np.outer(sigma, sigma)

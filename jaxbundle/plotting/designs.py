@@ -46,31 +46,35 @@ def network_view(
     view = axes_3d(ax, (7.5, 6.5))
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-    both = designed.before.network, designed.after.network
+    both_networks = designed.before.network, designed.after.network
     boxes = np.array(designed.conditions.obstacles).reshape(-1, 2, 3)
-    places = [x for n in both for x in (n.points.position, n.images.position)]
+    places = [x for n in both_networks for x in (n.points.position, n.images.position)]
     everything = np.concatenate([*places, *boxes])
     centre, size = extent(everything)
-    network = both[after]
+    network = both_networks[after]
     new = np.isin(np.array(network.images.id, dtype=object), designed.added)
-    for chosen, colour, name in ((~new, INK, "stations"), (new, RUST, "new photograph")):
-        if chosen.any():
-            lines = camera_lines(network, camera_size * size)[chosen].reshape(-1, 2, 3)
+    for is_of_kind, colour, name in ((~new, INK, "stations"), (new, RUST, "new photograph")):
+        if is_of_kind.any():
+            lines = camera_lines(network, camera_size * size)[is_of_kind].reshape(-1, 2, 3)
             view.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.8))
             view.scatter(
-                *network.images.position[chosen].T, s=9, color=colour, label=name, depthshade=False
+                *network.images.position[is_of_kind].T,
+                s=9,
+                color=colour,
+                label=name,
+                depthshade=False,
             )
     steps = [step.position for step in designed.path if len(step.position)]
     if after and designed.order == "first" and steps:
-        for way in np.stack(steps, 1):
-            view.plot(*way.T, color=BLUE, linewidth=0.7, alpha=0.7)
+        for path in np.stack(steps, 1):
+            view.plot(*path.T, color=BLUE, linewidth=0.7, alpha=0.7)
     view.scatter(*network.points.position.T, s=9, color=BLUE, label="targets", depthshade=False)
     for box in boxes:
         view.add_collection3d(Line3DCollection(_box_edges(box), colors=GREY, linewidths=0.8))
     low, high = everything.min(0), everything.max(0)
-    half = 0.55 * max((high - low).max(), size * camera_size)
+    half_extent = 0.55 * max((high - low).max(), size * camera_size)
     for name, middle in zip("xyz", (low + high) / 2):
-        getattr(view, f"set_{name}lim")(middle - half, middle + half)
+        getattr(view, f"set_{name}lim")(middle - half_extent, middle + half_extent)
         label(view, name, name.upper(), network.object_unit)
     quiet_3d(view)
     view.set_box_aspect((1, 1, 1), zoom=0.95)
@@ -105,9 +109,9 @@ def aim_path(designed: "Design", ax: "Axes | None" = None) -> "Axes":
     softness = np.array([s.softness for s in designed.path])
     aims = np.array([s.aim for s in designed.path])
     for value in dict.fromkeys(softness.tolist()):
-        chosen = softness == value
+        is_of_round = softness == value
         name = f"conditions soft to {value:g}" if value else "weights between 0 and 1"
-        ax.plot(steps[chosen], aims[chosen], ".-", linewidth=1, markersize=3, label=name)
+        ax.plot(steps[is_of_round], aims[is_of_round], ".-", linewidth=1, markersize=3, label=name)
     ax.axhline(designed.after.aim, color=INK, linewidth=0.8, linestyle="--", label="designed")
     if np.isfinite(designed.before.aim):
         ax.axhline(designed.before.aim, color=GREY, linewidth=0.8, linestyle="--", label="before")

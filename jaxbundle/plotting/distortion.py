@@ -78,7 +78,9 @@ def principal_point(adjustment: "Adjustment", camera: str) -> Float[np.ndarray, 
 
 def camera_index(adjustment: "Adjustment", camera: str) -> int:
     """The row of a camera in the arrays."""
-    return [given.id for given in adjustment.problem.network.cameras].index(camera)
+    return [camera_of_network.id for camera_of_network in adjustment.problem.network.cameras].index(
+        camera
+    )
 
 
 def _model(adjustment: "Adjustment", camera: str) -> CameraModel:
@@ -109,8 +111,8 @@ def distortion_at(
     out = np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
     centre = measured_centre(model, p)
     ideal = _ideal(model, p, centre + radius[:, None, None] * out)
-    found = _harmonics(model, p, centre, ideal, radius, jnp.asarray(out))
-    values, slopes = (np.array(x) for x in found)
+    harmonics = _harmonics(model, p, centre, ideal, radius, jnp.asarray(out))
+    values, slopes = (np.array(x) for x in harmonics)
     # Image coordinates are exact to about 450 times the rounding of one operation.
     noise = np.abs(values) < 1e-13 * (np.abs(centre).max() + radius)
     # The amplitude has no derivative where it is zero.
@@ -156,8 +158,8 @@ def _harmonics(
         tangential = dy * cosine - dx * sine
         a, b = 2 * (tangential * cosine).mean(), 2 * (tangential * sine).mean()
         square = a * a + b * b
-        there = square > 0  # where it is not, the root would have the derivative NaN
-        amplitude = jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
+        is_positive = square > 0  # where it is not, the root would have the derivative NaN
+        amplitude = jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, square, 1.0)), 0.0)
         return jnp.stack([radial, amplitude])
 
     values = jax.vmap(amplitudes, (None, 0, 0), 1)(p, radius, ideal)

@@ -62,8 +62,8 @@ def save_figures(
     """
     need_matplotlib()
     with replace_folder(folder, "save_figures", FIGURES, force) as new:
-        written = draw_figures(adjustment, new, progress)
-    return [Path(folder) / path.name for path in written]
+        paths_written = draw_figures(adjustment, new, progress)
+    return [Path(folder) / path.name for path in paths_written]
 
 
 def draw_figures(
@@ -125,7 +125,7 @@ def draw_pairs(
 
 def draw_tracks(
     adjustment: "Adjustment",
-    read: Callable[[str], np.ndarray],
+    read_photograph: Callable[[str], np.ndarray],
     folder: Path,
     progress: Progress | None = None,
     max_images: int = 12,
@@ -135,7 +135,9 @@ def draw_tracks(
     **Arguments:** `read(image)`: its grey values, of any size.
     """
     images = adjustment.network.images.id
-    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), max_images)).astype(int))
+    chosen_rows = np.unique(
+        np.linspace(0, len(images) - 1, min(len(images), max_images)).astype(int)
+    )
     names = FigureNames(())
     return write_figures(
         folder,
@@ -143,9 +145,11 @@ def draw_tracks(
             names("tracks", images[k]): (
                 (8, 6),
                 None,
-                lambda ax, id=images[k]: tracks_in_photograph(adjustment, id, read(id), ax),
+                lambda ax, id=images[k]: tracks_in_photograph(
+                    adjustment, id, read_photograph(id), ax
+                ),
             )
-            for k in chosen
+            for k in chosen_rows
         },
         progress,
     )
@@ -168,14 +172,14 @@ def write_figures(
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from error
     tell = progress or (lambda *_: None)
-    written: list[Path] = []
+    paths_written: list[Path] = []
     for name, (size, projection, draw) in drawings.items():
-        tell(DRAWING, len(written), len(drawings))
+        tell(DRAWING, len(paths_written), len(drawings))
         path = folder / f"{name}.png"
         write_bytes(path, png(size, projection, draw))
-        written.append(path)
-    tell(DRAWING, len(written), len(drawings))
-    return written
+        paths_written.append(path)
+    tell(DRAWING, len(paths_written), len(drawings))
+    return paths_written
 
 
 def png(
@@ -206,8 +210,8 @@ def png(
 class FigureNames:
     """File names from ids: letters, digits, dot, dash and underscore; each once, in any case."""
 
-    def __init__(self, taken: Iterable[str]):
-        self.taken = {name.casefold() for name in taken}
+    def __init__(self, names_taken: Iterable[str]):
+        self.taken = {name.casefold() for name in names_taken}
 
     def __call__(self, kind: str, id: str) -> str:
         id = PHOTOGRAPH.sub("", str(id)) or id

@@ -22,18 +22,18 @@ def image_frame(
     """
     network = adjustment.problem.network
     c = camera_index(adjustment, camera)
-    given, model = network.cameras[c], get_model(network.cameras[c].model)
-    size, pitch = given.image_size, given.pixel_size
+    network_camera, model = network.cameras[c], get_model(network.cameras[c].model)
+    size, pitch = network_camera.image_size, network_camera.pixel_size
     if size is not None and model.unit == "px":
-        half = np.array(size) / 2
+        half_size = np.array(size) / 2
         # The first pixel has its centre, not its corner, at 0.
-        centre = half - 0.5 if model.axes == "down" else np.zeros(2)
-        return centre - half, centre + half, True
+        centre = half_size - 0.5 if model.axes == "down" else np.zeros(2)
+        return centre - half_size, centre + half_size, True
     if size is not None and pitch is not None:
-        half = np.array(size) * np.abs(pitch) / 2
-        return -half, half, True
-    used = adjustment.problem.camera == c
-    xy = adjustment.problem.image_coordinates()[used]
+        half_size = np.array(size) * np.abs(pitch) / 2
+        return -half_size, half_size, True
+    is_of_camera = adjustment.problem.camera == c
+    xy = adjustment.problem.image_coordinates()[is_of_camera]
     if not len(xy):
         return -np.ones(2), np.ones(2), False
     return xy.min(0), xy.max(0), False
@@ -50,13 +50,13 @@ def measured(adjustment: "Adjustment", image: str) -> tuple[np.ndarray, ...]:
     weight = problem.image_weights
     rows = np.flatnonzero((problem.image == i) & (weight > 0).any(1))
     weight = np.where(weight[rows] > 0, weight[rows], np.nan)
-    found = adjustment.reliability
+    reliability = adjustment.reliability
     ids = np.array(adjustment.problem.network.points.id, dtype=object)
     return (
         ids[problem.point[rows]],
         problem.image_coordinates()[rows],
-        problem.image_points(found.residual)[rows] / weight,
-        adjustment.pope(problem.image_points(found.w)[rows]),
+        problem.image_points(reliability.residual)[rows] / weight,
+        adjustment.pope(problem.image_points(reliability.w)[rows]),
     )
 
 

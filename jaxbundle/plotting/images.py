@@ -45,9 +45,9 @@ def residual_vectors(
     ax = axes(ax, (7, 6))
     points, xy, v, tau = measured(adjustment, image)
     network = adjustment.problem.network
-    given = network.cameras[network.images.camera[image_index(adjustment, image)]]
-    model = get_model(given.model)
-    low, high, known = image_frame(adjustment, given.id)
+    network_camera = network.cameras[network.images.camera[image_index(adjustment, image)]]
+    model = get_model(network_camera.model)
+    low, high, is_known = image_frame(adjustment, network_camera.id)
     low = np.minimum(low, xy.min(0, initial=np.inf))
     high = np.maximum(high, xy.max(0, initial=-np.inf))
     diagonal = float(np.hypot(*(high - low)))
@@ -57,11 +57,11 @@ def residual_vectors(
     scale, unit = micrometres(model.unit)
     bar = round_number(scale * 0.1 * diagonal / factor) / scale
     _draw_arrows(ax, xy, v, np.where(large, RUST, BLUE), factor, (bar, f"{scale * bar:g} {unit}"))
-    if known:
+    if is_known:
         _draw_frame(ax, low, high)
     if len(points) <= MAX_LABELS // 2:
         _write_names(ax, points, xy)
-    centre = principal_point(adjustment, given.id)
+    centre = principal_point(adjustment, network_camera.id)
     if (low <= centre).all() and (centre <= high).all():
         ax.plot(*centre, "+", color=GREY, markersize=9, zorder=2)
     margin = 0.07 * diagonal

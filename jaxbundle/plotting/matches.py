@@ -44,24 +44,24 @@ def match_graph(
     ax = axes(ax, (7, 7))
     turn = np.pi / 2 - 2 * np.pi * np.arange(len(names)) / max(len(names), 1)
     place = dict(zip(names, np.stack([np.cos(turn), np.sin(turn)], 1)))
-    most = max((verified for *_, verified, _ in pairs), default=1)
-    drawn = set()
-    for one, other, _, verified, kind in pairs:
+    largest_number = max((verified for *_, verified, _ in pairs), default=1)
+    kinds_drawn = set()
+    for image, partner, _, verified, kind in pairs:
         colour, line = KINDS[kind]
-        share = verified / most
+        share = verified / largest_number
         ax.plot(
-            *np.stack([place[one], place[other]], 1),
+            *np.stack([place[image], place[partner]], 1),
             line,
             color=colour,
             alpha=0.25 + 0.6 * share,
             linewidth=4.0 * max(share, 0.1),  # below 0.4 points a line vanishes
-            label="" if kind in drawn else kind,
+            label="" if kind in kinds_drawn else kind,
             zorder=2,
         )
-        drawn.add(kind)
-    at = np.array(list(place.values()))
-    lonely = np.isin(names, list(alone))
-    ax.scatter(*at.T, s=36, color=np.where(lonely, RUST, INK), zorder=3)
+        kinds_drawn.add(kind)
+    places_of_images = np.array(list(place.values()))
+    is_alone = np.isin(names, list(alone))
+    ax.scatter(*places_of_images.T, s=36, color=np.where(is_alone, RUST, INK), zorder=3)
     if len(names) <= MAX_LABELS:
         for name, angle in zip(names, turn):
             c, s = 1.06 * np.cos(angle), 1.06 * np.sin(angle)
@@ -82,9 +82,9 @@ def match_graph(
         ax,
         "Match graph",
         f"{len(names)} photographs, {len(pairs)} verified pairs, "
-        f"{most if pairs else 0} matches at most",
+        f"{largest_number if pairs else 0} matches at most",
     )
-    if len(drawn) > 1:
+    if len(kinds_drawn) > 1:
         legend(ax, loc="lower right")
     return ax
 
@@ -97,11 +97,11 @@ def overlap_matrix(names: Sequence[str], pairs: Pairs, ax: "Axes | None" = None)
     ax = axes(ax, (7, 6))
     index = {name: k for k, name in enumerate(names)}
     number = np.full((len(names), len(names)), np.nan)
-    for one, other, _, verified, _ in pairs:
-        i, j = index[one], index[other]
+    for image, partner, _, verified, _ in pairs:
+        i, j = index[image], index[partner]
         number[i, j] = number[j, i] = verified
-    shown = ax.imshow(number, cmap="Blues", vmin=0)
-    ax.figure.colorbar(shown, ax=ax, shrink=0.8, label="verified matches")
+    drawn_matrix = ax.imshow(number, cmap="Blues", vmin=0)
+    ax.figure.colorbar(drawn_matrix, ax=ax, shrink=0.8, label="verified matches")
     if len(names) <= MAX_LABELS:
         ax.set_xticks(range(len(names)), map(plain, names), rotation=90, parse_math=False)
         ax.set_yticks(range(len(names)), map(plain, names), parse_math=False)
@@ -137,8 +137,8 @@ def tracks_in_photograph(
     """
     ax = axes(ax, (8, 6))
     problem, i = adjustment.problem, image_index(adjustment, image)
-    used = problem.used
-    rays = np.bincount(problem.point[used], minlength=len(problem.network.points))
+    is_used = problem.used
+    rays = np.bincount(problem.point[is_used], minlength=len(problem.network.points))
     rows = problem.image == i
     xy = problem.image_coordinates()
     columns, height = problem.network.cameras[problem.network.images.camera[i]].image_size
@@ -150,8 +150,8 @@ def tracks_in_photograph(
         alpha=0.75,
         extent=(-0.5, columns - 0.5, height - 0.5, -0.5),
     )
-    good = rows & used
-    shown = ax.scatter(
+    good = rows & is_used
+    scatter = ax.scatter(
         *xy[good].T,
         s=7,
         c=rays[problem.point[good]],
@@ -160,9 +160,9 @@ def tracks_in_photograph(
         linewidths=0,
         zorder=3,
     )
-    bad = rows & ~used
+    bad = rows & ~is_used
     ax.scatter(*xy[bad].T, s=18, marker="x", color=RUST, linewidths=0.8, zorder=4)
-    ax.figure.colorbar(shown, ax=ax, shrink=0.8, label="photographs that show the point")
+    ax.figure.colorbar(scatter, ax=ax, shrink=0.8, label="photographs that show the point")
     ax.set_xlim(-0.5, columns - 0.5)
     ax.set_ylim(height - 0.5, -0.5)
     quiet(ax, grid=False)

@@ -49,7 +49,7 @@ def coverage_map(
     """
     ax = axes(ax, (7, 5.6))
     w, h = image_size
-    shown = ax.imshow(
+    drawn_map = ax.imshow(
         np.ma.masked_equal(coverage.counts, 0),
         cmap="Blues",
         vmin=0,
@@ -59,12 +59,12 @@ def coverage_map(
     )
     ax.plot(*uv.T, ".", color=INK, markersize=1.2, alpha=0.5)
     _frame(ax, image_size)
-    bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02)
+    bar = ax.figure.colorbar(drawn_map, ax=ax, shrink=0.8, pad=0.02)
     bar.set_label("points in a cell", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=8)
-    missing = [corner for corner, there in coverage.corners.items() if not there]
+    missing_corners = [corner for corner, is_there in coverage.corners.items() if not is_there]
     detail = f"{100 * coverage.part:.0f} % of the cells hold points"
-    detail += f"; none in the {', '.join(missing)} corner" if missing else ""
+    detail += f"; none in the {', '.join(missing_corners)} corner" if missing_corners else ""
     title(ax, f"Camera {name}: coverage", detail)
     return ax
 
@@ -86,15 +86,15 @@ def _label_places(lines: "QuadContourSet", size: np.ndarray) -> list[tuple[float
     """Where the contours have their labels: in the middle of the longest piece of each, away from
     the frame of the image and from one another."""
     # Two digits of σ, 7 points high, are about 0.08 of an image as wide as the figure.
-    margin, found = 0.08 * size, []
+    margin, places = 0.08 * size, []
     for pieces in lines.allsegs:
         for vertices in sorted(pieces, key=len, reverse=True)[:1]:
-            inside = ((vertices > margin) & (vertices < size - 1 - margin)).all(1)
-            apart = [np.abs((vertices - place) / margin).max(1) > 1 for place in found]
-            good = vertices[np.all([inside, *apart], axis=0)]
+            is_inside = ((vertices > margin) & (vertices < size - 1 - margin)).all(1)
+            is_apart = [np.abs((vertices - place) / margin).max(1) > 1 for place in places]
+            good = vertices[np.all([is_inside, *is_apart], axis=0)]
             if len(good):
-                found.append(tuple(good[len(good) // 2]))
-    return found
+                places.append(tuple(good[len(good) // 2]))
+    return places
 
 
 def uncertainty_image(
@@ -120,7 +120,7 @@ def uncertainty_image(
     u, v = uncertainty.uv[0, :, 0], uncertainty.uv[:, 0, 1]
     levels = np.geomspace(low, high, 13)
     u, v, sigma = _smooth(u, v, sigma)
-    shown = ax.contourf(
+    contours = ax.contourf(
         u,
         v,
         np.ma.masked_invalid(sigma),
@@ -136,7 +136,7 @@ def uncertainty_image(
     if places:
         ax.clabel(lines, fmt="%.2g", fontsize=7, manual=places)
     _frame(ax, image_size)
-    bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02, format="%.2g")
+    bar = ax.figure.colorbar(contours, ax=ax, shrink=0.8, pad=0.02, format="%.2g")
     bar.set_label("σ of a projected point [px]", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=8)
     where = {
@@ -176,11 +176,17 @@ def uncertainty_curve(
     if np.isfinite(corners).any():  # A wide lens may have no rays there.
         ax.loglog(distances, corners, color=RUST, linewidth=1.5, label="worst corner")
     if reported is not None:
-        away, *both = reported
-        for values, colour in zip(both, (BLUE, RUST)):
-            known, there = np.isfinite(values), np.isfinite(away)
-            ax.plot(away[there & known], values[there & known], "o", color=colour, markersize=5)
-            for x, y in zip(away[there & known], values[there & known]):
+        distance, *sigma_of_both = reported
+        for values, colour in zip(sigma_of_both, (BLUE, RUST)):
+            has_sigma, is_finite = np.isfinite(values), np.isfinite(distance)
+            ax.plot(
+                distance[is_finite & has_sigma],
+                values[is_finite & has_sigma],
+                "o",
+                color=colour,
+                markersize=5,
+            )
+            for x, y in zip(distance[is_finite & has_sigma], values[is_finite & has_sigma]):
                 ax.annotate(
                     f"{y:.3g}",
                     (x, y),
@@ -189,7 +195,7 @@ def uncertainty_curve(
                     fontsize=7,
                     color=colour,
                 )
-            for y in values[known & ~there]:
+            for y in values[has_sigma & ~is_finite]:
                 ax.axhline(y, color=colour, linewidth=0.8, linestyle=":")
                 ax.annotate(
                     f"{y:.3g} at infinity",

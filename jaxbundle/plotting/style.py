@@ -135,9 +135,9 @@ def extent(xyz: ArrayLike) -> tuple[np.ndarray, float]:
     # A few per cent of outliers do not change these quantiles.
     low, middle, high = np.quantile(xyz, [0.02, 0.5, 0.98], axis=0)
     reach = 3 * np.maximum(high - low, 1e-12 + 1e-3 * (high - low).max())
-    seen = xyz[(np.abs(xyz - middle) <= reach).all(1)]
-    seen = seen if len(seen) else xyz
-    low, high = seen.min(0), seen.max(0)
+    near_points = xyz[(np.abs(xyz - middle) <= reach).all(1)]
+    near_points = near_points if len(near_points) else xyz
+    low, high = near_points.min(0), near_points.max(0)
     return (low + high) / 2, float(max((high - low).max(), 1e-9))
 
 

@@ -27,17 +27,17 @@ def cloud_perspective(
     **Returns:** matplotlib `Axes3D`, in the object unit.
     """
     view = axes_3d(ax, (7.5, 6.0))
-    few = cloud.take(np.arange(0, len(cloud), max(1, -(-len(cloud) // max_points))))
-    sigma = few.sigma[:, "XYZ".index(axis)]
+    drawn_points = cloud.take(np.arange(0, len(cloud), max(1, -(-len(cloud) // max_points))))
+    sigma = drawn_points.sigma[:, "XYZ".index(axis)]
     limit = np.nanpercentile(sigma, 95) if np.isfinite(sigma).any() else 1.0
     # Marks that touch their neighbours: of an area of about 300 by 300 typographical points.
-    mark = np.clip(300**2 / max(len(few), 1), 1.0, 16.0)
-    drawn = view.scatter(
-        *few.X.T, c=sigma, s=mark, cmap="viridis", vmin=0, vmax=limit, linewidths=0
+    mark = np.clip(300**2 / max(len(drawn_points), 1), 1.0, 16.0)
+    scatter = view.scatter(
+        *drawn_points.X.T, c=sigma, s=mark, cmap="viridis", vmin=0, vmax=limit, linewidths=0
     )
-    view.set_box_aspect(np.maximum(np.ptp(few.X, axis=0), 1e-9))
+    view.set_box_aspect(np.maximum(np.ptp(drawn_points.X, axis=0), 1e-9))
     quiet_3d(view)
-    view.figure.colorbar(drawn, ax=view, label=f"σ{axis}", shrink=0.6)
+    view.figure.colorbar(scatter, ax=view, label=f"σ{axis}", shrink=0.6)
     for name in "xyz":
         label_coordinates(view, name, "")
     return view
@@ -52,7 +52,7 @@ def dsm_relief(dsm: Dsm, ax: Axes | None = None) -> Axes:
 
     ax = axes(ax, (7.0, 6.0))
     Z = np.where(np.isfinite(dsm.height), dsm.height, np.nanmean(dsm.height))
-    down, right = np.gradient(Z, dsm.size) if min(Z.shape) > 1 else (0 * Z, 0 * Z)
+    slope_down, slope_right = np.gradient(Z, dsm.size) if min(Z.shape) > 1 else (0 * Z, 0 * Z)
     # From the upper left, as in maps: under light from below, valleys look like ridges.
     azimuth, elevation, ambient = np.radians(315.0), np.radians(45.0), 0.35
     # The normal (−∂Z/∂x, −∂Z/∂y, 1), y against the rows.
@@ -63,7 +63,9 @@ def dsm_relief(dsm: Dsm, ax: Axes | None = None) -> Axes:
             np.sin(elevation),
         ]
     )
-    shade = (-right * light[0] + down * light[1] + light[2]) / np.sqrt(1 + right**2 + down**2)
+    shade = (-slope_right * light[0] + slope_down * light[1] + light[2]) / np.sqrt(
+        1 + slope_right**2 + slope_down**2
+    )
     low, high = np.nanpercentile(dsm.height, [1, 99])
     colour = colormaps["terrain"](np.clip((Z - low) / max(high - low, 1e-9), 0, 1) * 0.8 + 0.1)
     colour[..., :3] *= (ambient + (1 - ambient) * np.clip(shade, 0, 1))[..., None]

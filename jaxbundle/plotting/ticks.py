@@ -46,9 +46,10 @@ def name_ticks(values: Float[np.ndarray, " n"]) -> list[str]:
     if 1e-4 <= largest < 10.0**TICK_DIGITS:
         return [f"{value:.{max(places, 0)}f}" for value in values]
     exponent = math.floor(math.log10(largest) + 1e-9)  # one for all ticks of an axis
-    shown = max(exponent + places, 0)
+    decimals = max(exponent + places, 0)
     return [
-        f"{value / 10.0**exponent:.{shown}f}e{exponent:+03d}" if value else "0" for value in values
+        f"{value / 10.0**exponent:.{decimals}f}e{exponent:+03d}" if value else "0"
+        for value in values
     ]
 
 
@@ -56,9 +57,9 @@ def _places(values: Float[np.ndarray, " n"]) -> int:
     """Decimal places of the step, which is 1, 2, 2.5 or 5 times a power of ten; negative for tens,
     hundreds, …"""
     step = float(values[1] - values[0])
-    first = -math.floor(math.log10(step) + 1e-9)
-    whole = step * 10.0**first
-    return first if abs(whole - round(whole)) < 1e-3 else first + 1
+    digits = -math.floor(math.log10(step) + 1e-9)
+    scaled = step * 10.0**digits
+    return digits if abs(scaled - round(scaled)) < 1e-3 else digits + 1
 
 
 def offset_in_words(offset: float) -> str:
@@ -70,9 +71,11 @@ def label_coordinates(ax: "Axes", axis: str, unit: str) -> None:
     """The label and the ticks of a coordinate axis in the limits it has: X, Y or Z."""
     from matplotlib.ticker import Formatter
 
-    drawn = getattr(ax, f"{axis}axis")
-    low, high = sorted(drawn.get_view_interval())
-    offset, _ = label_ticks([tick for tick in drawn.get_majorticklocs() if low <= tick <= high])
+    coordinate_axis = getattr(ax, f"{axis}axis")
+    low, high = sorted(coordinate_axis.get_view_interval())
+    offset, _ = label_ticks(
+        [tick for tick in coordinate_axis.get_majorticklocs() if low <= tick <= high]
+    )
 
     class WithoutOffset(Formatter):
         def __call__(self, value: float, _: int | None = None) -> str:
@@ -82,6 +85,6 @@ def label_coordinates(ax: "Axes", axis: str, unit: str) -> None:
         def format_ticks(self, values: Sequence[float]) -> list[str]:
             return name_ticks(np.array(values) - offset)
 
-    drawn.set_major_formatter(WithoutOffset())
+    coordinate_axis.set_major_formatter(WithoutOffset())
     label(ax, axis, axis.upper(), unit)
-    drawn.set_label_text(drawn.get_label_text() + offset_in_words(offset))
+    coordinate_axis.set_label_text(coordinate_axis.get_label_text() + offset_in_words(offset))

@@ -103,19 +103,19 @@ def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size))
     _draw_cameras(ax, pyramids)
     for role in ROLE_STYLE:
-        chosen = points["xyz"][points["role"] == role]
-        if len(chosen):
+        points_of_role = points["xyz"][points["role"] == role]
+        if len(points_of_role):
             ax.scatter(
-                chosen[:, 0],
-                chosen[:, 1],
+                points_of_role[:, 0],
+                points_of_role[:, 1],
                 label=f"{role} points",
                 linewidths=0,
                 zorder=5,
                 **_lighter(role, len(points["id"])),
             )
     ellipses, selection = _draw_ellipses(adjustment, ax, size)
-    drawn = (points["xyz"][:, :2], pyramids[:, :, :2].reshape(-1, 2), ellipses.reshape(-1, 2))
-    low, high = _inside(np.concatenate(drawn))
+    parts_drawn = (points["xyz"][:, :2], pyramids[:, :, :2].reshape(-1, 2), ellipses.reshape(-1, 2))
+    low, high = _inside(np.concatenate(parts_drawn))
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
     ax.set_aspect("equal")
@@ -126,11 +126,11 @@ def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
     name = f"{adjustment.network.name}: seen along Z"
     title(ax, name, selection and f"error ellipses {selection}")
     _legend_below(ax)
-    away = centres - pyramids[:, 1:].mean(1)
+    viewing = centres - pyramids[:, 1:].mean(1)
     upper_right = np.full((len(points["id"]), 2), 0.7)
     ids = []
     if len(centres) <= MAX_LABELS // 2:
-        ids.append((adjustment.images["id"], centres, INK, away[:, :2] / size))
+        ids.append((adjustment.images["id"], centres, INK, viewing[:, :2] / size))
     if len(points["id"]) <= MAX_LABELS:
         ids.append((points["id"], points["xyz"], BLUE, upper_right))
     # Beyond some thousands of dots an id finds no room in any case.
@@ -190,24 +190,24 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
     view.add_collection3d(Line3DCollection(edges, colors=GREY, linewidths=0.7))
     view.scatter(*centres.T, s=8, color=INK, label="cameras", depthshade=False)
     for role in ROLE_STYLE:
-        chosen = points["xyz"][points["role"] == role]
-        if len(chosen):
+        points_of_role = points["xyz"][points["role"] == role]
+        if len(points_of_role):
             view.scatter(
-                *chosen.T,
+                *points_of_role.T,
                 label=f"{role} points",
                 linewidths=0,
                 depthshade=False,
                 **_behind_ellipsoids(role, len(points["id"]), ellipses),
             )
     if ellipses.total:
-        drawn = Poly3DCollection(
+        pyramids_drawn = Poly3DCollection(
             list(principal_sections(adjustment, ellipses)),
             facecolors=to_rgba(BLUE, 0.1),
             edgecolors=to_rgba(BLUE, 0.8),
             linewidths=0.6,
             label=f"error ellipsoids (1σ, {PROBABILITY[3]}) {ellipses.exaggeration}",
         )
-        view.add_collection3d(drawn)
+        view.add_collection3d(pyramids_drawn)
     if len(ellipses.wide):
         places = adjustment.point_values[ellipses.wide]
         view.scatter(*places.T, depthshade=False, **TOO_WIDE)
@@ -243,18 +243,18 @@ def camera_pyramids(adjustment: "Adjustment", size: float) -> np.ndarray:
     network, values = adjustment.problem.network, adjustment.values
     M = np.asarray(jax.vmap(matrix_from_quaternion)(values["image"].rotation))
     centres = adjustment.image_values[:, :3]
-    models = [get_model(given.model) for given in network.cameras]
+    models = [get_model(network_camera.model) for network_camera in network.cameras]
     frames = np.array([np.stack(image_frame(adjustment, c.id)[:2]) for c in network.cameras])
     corners = np.zeros((len(models), 4, 3))
     interior = np.asarray(adjustment.problem.interior_orientation(values))
     for model in dict.fromkeys(models):
-        chosen = [c for c, other in enumerate(models) if other == model]
-        p = interior[np.array(chosen), : len(model.parameters)]
-        corners[chosen] = _corner_rays(model, p, frames[chosen])
+        cameras_of_model = [c for c, other_model in enumerate(models) if other_model == model]
+        p = interior[np.array(cameras_of_model), : len(model.parameters)]
+        corners[cameras_of_model] = _corner_rays(model, p, frames[cameras_of_model])
     # If the distortion turns back inside the frame there is no ray: an approximate corner instead.
-    missing = ~np.all(np.isfinite(corners), axis=2)
+    is_missing = ~np.all(np.isfinite(corners), axis=2)
     plain = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
-    corners = np.where(missing[:, :, None], plain, corners)
+    corners = np.where(is_missing[:, :, None], plain, corners)
     # Corners at one depth, of a lens far from a hemisphere, make a plane rectangle.
     flat = np.all(corners[:, :, 2] < -0.2, axis=1)
     corners[flat] /= -corners[flat][:, :, 2:]
@@ -283,14 +283,14 @@ def pyramid_size(centres: Float[np.ndarray, "n 3"], size: float) -> float:
     return float(np.clip(0.9 * _neighbour(centres), 0.045 * size, 0.15 * size))
 
 
-def _neighbour(places: Float[np.ndarray, "n d"], most: int = 400) -> float:
+def _neighbour(places: Float[np.ndarray, "n d"], max_sample: int = 400) -> float:
     """The median distance to the nearest neighbour, from a sample; infinite for a single place."""
     if len(places) < 2:
         return np.inf
-    sample = places[:: max(1, len(places) // most)]
-    away = np.linalg.norm(sample[:, None] - places[None], axis=2)
-    away[away == 0] = np.inf
-    return float(np.median(away.min(1)))
+    sample = places[:: max(1, len(places) // max_sample)]
+    distances = np.linalg.norm(sample[:, None] - places[None], axis=2)
+    distances[distances == 0] = np.inf
+    return float(np.median(distances.min(1)))
 
 
 # --- points ---------------------------------------------------------------------------------
@@ -299,8 +299,12 @@ def _neighbour(places: Float[np.ndarray, "n d"], most: int = 400) -> float:
 def _points(adjustment: "Adjustment") -> dict[str, np.ndarray]:
     """Ids, roles and coordinates, including check points; without points at any distance."""
     table = adjustment.points
-    there = adjustment.located
-    id, role, xyz = table["id"][there], table["role"][there], adjustment.point_values[there]
+    is_located = adjustment.located
+    id, role, xyz = (
+        table["id"][is_located],
+        table["role"][is_located],
+        adjustment.point_values[is_located],
+    )
     checks = adjustment.check_points
     if checks is not None:
         id = np.concatenate([id, np.array(checks.id, dtype=object)])
@@ -349,15 +353,16 @@ class Ellipses(NamedTuple):
     @property
     def selection(self) -> str:
         """Which ones are drawn if there are more."""
-        drawn, wide = len(self.rows), len(self.wide)
-        if drawn == self.total:
+        number_drawn, wide = len(self.rows), len(self.wide)
+        if number_drawn == self.total:
             return ""
-        words = f"of {drawn} of {self.total} points"
+        words = f"of {number_drawn} of {self.total} points"
         if wide:
             words += f" (too wide to be drawn: {wide})"
-        if drawn + wide < self.total:
-            rest = " of the rest" if wide else ""
-            words += f": the {self.largest} largest{rest} and {drawn - self.largest} others"
+        if number_drawn + wide < self.total:
+            rest_in_words = " of the rest" if wide else ""
+            others = number_drawn - self.largest
+            words += f": the {self.largest} largest{rest_in_words} and {others} others"
         return words
 
 
@@ -366,25 +371,27 @@ def choose_ellipses(adjustment: "Adjustment", size: float, settings: EllipseSett
     half-axis of half the median distance of neighbours, within the limits of the `settings`."""
     dimensions = settings.dimensions
     covariance = adjustment.point_covariance[:, :dimensions, :dimensions]
-    known = np.isfinite(covariance).all((1, 2))
+    is_known = np.isfinite(covariance).all((1, 2))
     half_axis = np.zeros(len(covariance))
-    half_axis[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known])[:, -1], 0))
-    there = np.flatnonzero(adjustment.located & (half_axis > 0))
-    if not len(there):
-        return Ellipses(there, 0, 1.0)
-    places, half_axis = adjustment.point_values[there], half_axis[there]
+    half_axis[is_known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[is_known])[:, -1], 0))
+    candidate_rows = np.flatnonzero(adjustment.located & (half_axis > 0))
+    if not len(candidate_rows):
+        return Ellipses(candidate_rows, 0, 1.0)
+    places, half_axis = adjustment.point_values[candidate_rows], half_axis[candidate_rows]
     rows = thin_out(places, half_axis, size, settings)
     neighbour = _neighbour(places[rows, :dimensions])
     reach = np.clip(0.45 * neighbour, settings.smallest * size, settings.widest * size)
     longest = settings.longest * size
     # One in twenty at most is too wide.
-    middle, most = np.quantile(half_axis, [0.5, 0.95], method="lower")
-    factor = round_number(min(reach / middle, longest / most))
+    middle, large_axis = np.quantile(half_axis, [0.5, 0.95], method="lower")
+    factor = round_number(min(reach / middle, longest / large_axis))
     wide = factor * half_axis > longest
-    rest = np.flatnonzero(~wide)
-    rows = rest[thin_out(places[rest], half_axis[rest], size, settings)]
-    largest = settings.largest if len(rows) < len(rest) else 0
-    return Ellipses(there[rows], len(there), factor, there[wide], largest)
+    usual_rows = np.flatnonzero(~wide)
+    rows = usual_rows[thin_out(places[usual_rows], half_axis[usual_rows], size, settings)]
+    largest = settings.largest if len(rows) < len(usual_rows) else 0
+    return Ellipses(
+        candidate_rows[rows], len(candidate_rows), factor, candidate_rows[wide], largest
+    )
 
 
 def thin_out(
@@ -398,8 +405,8 @@ def thin_out(
     a network of this `size`."""
     if len(large) <= settings.largest + settings.sampled:
         return np.arange(len(large))
-    first, others = np.split(np.argsort(-large, kind="stable"), [settings.largest])
-    others = np.sort(others)
+    largest_rows, other_rows = np.split(np.argsort(-large, kind="stable"), [settings.largest])
+    other_rows = np.sort(other_rows)
     low, high = np.quantile(xyz, [0.01, 0.99], axis=0)
     wide = np.argsort(low - high)[:2]
     sides = np.maximum((high - low)[wide], 1e-12 * max(float((high - low).max()), 1e-300))
@@ -408,9 +415,9 @@ def thin_out(
     sampled = np.clip(np.prod(np.maximum(sides / room, 1)), 1, settings.sampled)
     cells = np.maximum(np.sqrt(sampled * sides / sides[::-1]).astype(int), 1)
     cells = np.minimum(cells, int(sampled))
-    at = np.clip((xyz[others][:, wide] - low[wide]) / sides * cells, 0, cells - 1).astype(int)
-    _, sample = np.unique(at[:, 0] * cells[1] + at[:, 1], return_index=True)
-    return np.sort(np.concatenate([first, others[sample[: settings.sampled]]]))
+    cell = np.clip((xyz[other_rows][:, wide] - low[wide]) / sides * cells, 0, cells - 1).astype(int)
+    _, sample = np.unique(cell[:, 0] * cells[1] + cell[:, 1], return_index=True)
+    return np.sort(np.concatenate([largest_rows, other_rows[sample[: settings.sampled]]]))
 
 
 def error_ellipses(adjustment: "Adjustment", ellipses: Ellipses, corners: int = 49) -> np.ndarray:
@@ -459,7 +466,7 @@ def _draw_ellipses(adjustment: "Adjustment", ax: "Axes", size: float) -> tuple[n
         places = adjustment.point_values[ellipses.wide, :2]
         ax.scatter(*places.T, zorder=6, **TOO_WIDE)
     polygons = error_ellipses(adjustment, ellipses)
-    drawn = LineCollection(
+    outlines = LineCollection(
         list(polygons),
         colors=BLUE,
         linewidths=0.8,
@@ -467,7 +474,7 @@ def _draw_ellipses(adjustment: "Adjustment", ax: "Axes", size: float) -> tuple[n
         alpha=0.8 if len(ellipses.rows) == ellipses.total else 0.5,
         label=f"error ellipses (1σ, {PROBABILITY[2]}) {ellipses.exaggeration}",
     )
-    ax.add_collection(drawn)
+    ax.add_collection(outlines)
     return polygons, ellipses.selection
 
 
@@ -487,19 +494,19 @@ def _write_ids(
     dots = ax.figure.dpi / 72
     # Of text of 7 points: a letter, a line and the gap between a dot and its text, in points.
     letter, line, gap = 4.9, 8.0, 4.0
-    taken = [(x - dots, x + dots, y - dots, y + dots) for x, y in ax.transData.transform(places)]
-    for ids, xyz, colour, away in tables:
-        for id, place, far in zip(ids, xyz, away):
+    occupied = [(x - dots, x + dots, y - dots, y + dots) for x, y in ax.transData.transform(places)]
+    for ids, xyz, colour, directions in tables:
+        for id, place, direction in zip(ids, xyz, directions):
             text = plain(id)
             x, y = ax.transData.transform(place[:2])
-            angle = np.arctan2(*far[::-1]) if np.hypot(*far) > 0.01 else np.pi / 4
+            angle = np.arctan2(*direction[::-1]) if np.hypot(*direction) > 0.01 else np.pi / 4
             turns = angle + np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
             extent_of = dots * letter * len(text), dots * line, dots * gap
             boxes = [_box(x, y, *extent_of, turn) for turn in turns]
-            best = min(range(len(boxes)), key=lambda i: _count_covered(boxes[i], taken, frame))
-            if _count_covered(boxes[best], taken, frame) > 0:
+            best = min(range(len(boxes)), key=lambda i: _count_covered(boxes[i], occupied, frame))
+            if _count_covered(boxes[best], occupied, frame) > 0:
                 continue
-            taken.append(boxes[best])
+            occupied.append(boxes[best])
             left, right, low, top = boxes[best]
             ax.annotate(
                 text,
@@ -526,11 +533,13 @@ def _box(
     return (middle_x - wide / 2, middle_x + wide / 2, middle_y - high / 2, middle_y + high / 2)
 
 
-def _count_covered(box: Box, taken: Sequence[Box], frame: "Bbox") -> float:
+def _count_covered(box: Box, occupied: Sequence[Box], frame: "Bbox") -> float:
     """The number of occupied boxes that a box covers, and whether it leaves the frame."""
     left, right, low, top = box
-    out = left < frame.x0 or right > frame.x1 or low < frame.y0 or top > frame.y1
-    return out + sum(left <= b[1] and b[0] <= right and low <= b[3] and b[2] <= top for b in taken)
+    is_outside = left < frame.x0 or right > frame.x1 or low < frame.y0 or top > frame.y1
+    return is_outside + sum(
+        left <= b[1] and b[0] <= right and low <= b[3] and b[2] <= top for b in occupied
+    )
 
 
 def _inside(
@@ -538,7 +547,7 @@ def _inside(
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """The corners of the visible part, with a margin."""
     centre, size = extent(xyz)
-    near = xyz[(np.abs(xyz - centre) <= 0.5 * size * (1 + 1e-9)).all(1)]
-    low, high = near.min(0), near.max(0)
+    near_points = xyz[(np.abs(xyz - centre) <= 0.5 * size * (1 + 1e-9)).all(1)]
+    low, high = near_points.min(0), near_points.max(0)
     margin = 0.05 * (high - low).max()
     return low - margin, high + margin

@@ -100,8 +100,8 @@ def attitude_table(
     """
     values = np.array(values, float)
     quaternions = values.ndim == 2 and values.shape[1] == 4
-    known = tuple(m for m in (*METHODS, "slerp") if m != "hermite")
-    _check_method(method, known, source)
+    methods = tuple(m for m in (*METHODS, "slerp") if m != "hermite")
+    _check_method(method, methods, source)
     if method == "slerp" and not quaternions:
         raise InputError(
             f"{source.name}: 'slerp' is for quaternions; interpolate angles by 'linear', "
@@ -170,17 +170,18 @@ def contradiction(
     trapezoid = (velocities[1:] + velocities[:-1]) / 2
     speed = np.linalg.norm(mean, axis=1)
     change = np.linalg.norm(np.diff(velocities, axis=0), axis=1)
-    off = np.linalg.norm(mean - trapezoid, axis=1)
+    difference = np.linalg.norm(mean - trapezoid, axis=1)
     # Velocities that are much too large excuse nothing.
-    allowed = tolerance * np.median(speed) + np.minimum(change, speed) / 2
-    if not (bad := off > allowed).any():
+    tolerance_of_step = tolerance * np.median(speed) + np.minimum(change, speed) / 2
+    if not (bad := difference > tolerance_of_step).any():
         return None
     k = int(bad.argmax())
     return VelocityContradiction(
         f"{source(k + 1)}: positions move by {speed[k]:.6g} m/s from the row before, velocities "
-        f"say {np.linalg.norm(trapezoid[k]):.6g} m/s, {off[k]:.6g} m/s from that; expected metres "
+        f"say {np.linalg.norm(trapezoid[k]):.6g} m/s, {difference[k]:.6g} m/s from that; expected "
+        "metres "
         "a second in the frame of the positions",
-        float((4 / 27 * step * off)[bad].max()),
+        float((4 / 27 * step * difference)[bad].max()),
     )
 
 
@@ -189,8 +190,8 @@ def continuous(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "r
 
     q and −q are one rotation, but between them interpolated components pass zero.
     """
-    same = np.sum(quaternions[1:] * quaternions[:-1], 1) >= 0
-    return quaternions * np.cumprod(np.r_[1, np.where(same, 1, -1)])[:, None]
+    is_same_sign = np.sum(quaternions[1:] * quaternions[:-1], 1) >= 0
+    return quaternions * np.cumprod(np.r_[1, np.where(is_same_sign, 1, -1)])[:, None]
 
 
 def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
@@ -199,10 +200,10 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
         raise InputError(f"{source(int(bad.argmax()))}: the time is not a finite number")
     if (bad := np.diff(times) <= 0).any():
         row = int(bad.argmax()) + 1
-        before, time = times[row - 1 : row + 1]
-        wrong = "occurs twice" if time == before else f"comes after {before:.15g} s"
+        previous, time = times[row - 1 : row + 1]
+        fault = "occurs twice" if time == previous else f"comes after {previous:.15g} s"
         raise InputError(
-            f"{source(row)}: the time {time:.15g} s {wrong}; sort the rows by time and keep "
+            f"{source(row)}: the time {time:.15g} s {fault}; sort the rows by time and keep "
             "each time once"
         )
 
@@ -213,8 +214,8 @@ def extrapolation_limit(
     """The maximum extrapolation, in seconds, of a product table with rows at these times: two of
     its steps, but at least 0.05 s and at most 0.5 s."""
     step = float(np.median(np.diff(rows))) if len(rows) > 1 else 0.0
-    wanted = max(settings.extrapolated_steps * step, settings.min_extrapolation)
-    return min(wanted, settings.max_extrapolation)
+    limit = max(settings.extrapolated_steps * step, settings.min_extrapolation)
+    return min(limit, settings.max_extrapolation)
 
 
 def warn_of_extrapolation(
@@ -229,13 +230,13 @@ def warn_of_extrapolation(
     """
     limit, rounding = extrapolation_limit(rows, settings), settings.time_rounding
     check_span(rows, limit, times, source)
-    before, after = rows[0] - times.min(), times.max() - rows[-1]
-    if max(before, after) <= rounding:
+    missing_before, missing_after = rows[0] - times.min(), times.max() - rows[-1]
+    if max(missing_before, missing_after) <= rounding:
         return ()
     number = int(((times < rows[0] - rounding) | (times > rows[-1] + rounding)).sum())
     where = " and ".join(
         f"{value:.6g} s {text}"
-        for value, text in ((before, "at its start"), (after, "at its end"))
+        for value, text in ((missing_before, "at its start"), (missing_after, "at its end"))
         if value > rounding
     )
     return (
@@ -249,29 +250,29 @@ def check_span(
     extrapolate: float,
     times: Float[np.ndarray, " n"],
     source: Source,
-    thing: str = "image line",
+    noun: str = "image line",
 ) -> None:
     """Refuse times outside a table by more than the allowed extrapolation."""
-    outside = (times < rows[0] - extrapolate) | (times > rows[-1] + extrapolate)
-    if outside.any():
-        k = int(outside.argmax())
+    is_outside = (times < rows[0] - extrapolate) | (times > rows[-1] + extrapolate)
+    if is_outside.any():
+        k = int(is_outside.argmax())
         beyond = f"at most {extrapolate:.6g} s are" if extrapolate else "nothing is"
         raise InputError(
-            f"{source.name}: {thing} {k} is at {times[k]:.9g} s, outside the table, "
+            f"{source.name}: {noun} {k} is at {times[k]:.9g} s, outside the table, "
             f"{rows[0]:.9g} to {rows[-1]:.9g} s; give ancillary data for the whole image, {beyond} "
             "extrapolated"
         )
 
 
 def check_covered(
-    table: TimeTable, times: Numbers, source: Source, thing: str = "image line"
+    table: TimeTable, times: Numbers, source: Source, noun: str = "image line"
 ) -> None:
     """Refuse a table that does not cover the times, or has a gap among them.
 
-    `source` names the table and its rows, `thing` what the times belong to.
+    `source` names the table and its rows, `noun` what the times belong to.
     """
     rows, times = np.asarray(table.times), np.asarray(times, float)
-    check_span(rows, table.extrapolate, times, source, thing)
+    check_span(rows, table.extrapolate, times, source, noun)
     # As in `interpolation.interval`, which decides for the image.
     i = np.clip(np.searchsorted(rows, times, side="right") - 1, 0, len(rows) - 2)
     wide = rows[i + 1] - rows[i] > table.gap
@@ -279,16 +280,16 @@ def check_covered(
         k = int(wide.argmax())
         start, end = rows[i[k]], rows[i[k] + 1]
         raise InputError(
-            f"{source(i[k] + 1)}: {thing} {k} at {times[k]:.9g} s is in the gap of "
+            f"{source(i[k] + 1)}: {noun} {k} at {times[k]:.9g} s is in the gap of "
             f"{end - start:.6g} s before this row; allow it with gap = {end - start:.6g}, or give "
             "rows"
         )
 
 
-def _check_method(method: str, known: Sequence[str], source: Source) -> None:
-    if method not in known:
+def _check_method(method: str, methods: Sequence[str], source: Source) -> None:
+    if method not in methods:
         raise InputError(
-            f"{source.name}: unknown interpolation {method!r}{did_you_mean(method, known)}"
+            f"{source.name}: unknown interpolation {method!r}{did_you_mean(method, methods)}"
         )
 
 
@@ -300,7 +301,7 @@ def _table(
     order: int,
     gap: float | None,
     extrapolate: float,
-    what: str,
+    noun: str,
     source: Source,
 ) -> TimeTable:
     # Masked values are NaN, and refused with their row.
@@ -308,11 +309,11 @@ def _table(
     times, values = plain(times), plain(values)
     if values.ndim != 2 or times.shape != values.shape[:1]:
         raise InputError(
-            f"{source.name}: {times.shape} times and {what}s of shape {values.shape}; one row of "
+            f"{source.name}: {times.shape} times and {noun}s of shape {values.shape}; one row of "
             "values a time is expected"
         )
     rates = None if rates is None else plain(rates)
-    for name, array in ((what, values), ("velocity", rates)):
+    for name, array in ((noun, values), ("velocity", rates)):
         if array is not None and (bad := ~np.isfinite(array).all(1)).any():
             raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
     if method in ("lagrange", "usgscsm") and order < 1:

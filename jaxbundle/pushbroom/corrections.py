@@ -64,12 +64,12 @@ class Corrections(NamedTuple):
         return self.light_time or self.aberration or self.refraction
 
 
-def true_direction(seen: Vector, velocity: Vector) -> Triple:
-    """The unit vector l of light seen along `seen`: c·l = k·seen − v, k > 0."""
-    a, b = dot(seen, seen), dot(seen, velocity)
+def true_direction(apparent: Vector, velocity: Vector) -> Triple:
+    """The unit vector l of light seen along `apparent`: c·l = k·seen − v, k > 0."""
+    a, b = dot(apparent, apparent), dot(apparent, velocity)
     c = dot(velocity, velocity) - LIGHT**2
     k = (b + jnp.sqrt(b * b - a * c)) / a
-    return scale_vector(1 / LIGHT, point_on_ray(scale_vector(-1.0, velocity), seen, k))
+    return scale_vector(1 / LIGHT, point_on_ray(scale_vector(-1.0, velocity), apparent, k))
 
 
 def apparent_direction(true: Vector, velocity: Vector) -> Triple:
@@ -108,20 +108,22 @@ def refract(earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector) -> tu
     **Raises:** `ValueError` without an ellipsoid."""
     earth = require_ellipsoid(earth)
     start = geodetic(earth, o)[2]
-    both = jnp.stack(jnp.broadcast_arrays(start, height))
-    (N1, N2), (above, whole) = ((v[0], v[1]) for v in map(jnp.asarray, refractivity(both)))
+    both_heights = jnp.stack(jnp.broadcast_arrays(start, height))
+    (N1, N2), (above_start, above_ground) = (
+        (v[0], v[1]) for v in map(jnp.asarray, refractivity(both_heights))
+    )
     # N₂ − N₁ is the divisor of the mean: 1e-12 moves a ray by 1 µm in 1000 km
     bends = (start > height) & (N2 - N1 > 1e-12)
     step = jnp.where(bends, N2 - N1, 1.0)
-    mean = (whole - above - N1 * (start - height)) / step
+    mean = (above_ground - above_start - N1 * (start - height)) / step
     # The heights of the bending dN/dh have a standard deviation of 0.86 of their mean above the
     # ground at sea level, 0.88 at 3.4 km, 0.95 at 8.8 km in this atmosphere (1: exponential). Below
     # an aircraft the air ends at the aircraft: the upper border, 1 + √2 < 3 times the spread above
     # the mean, stays under it.
-    spread = jnp.minimum(0.88 * mean, (start - height - mean) / 3)
+    node_spread = jnp.minimum(0.88 * mean, (start - height - mean) / 3)
     *ray, index = *o, *unit(d), N1
     for node, weight in NODES:
-        border = at_height(earth, height + mean + node * spread)
+        border = at_height(earth, height + mean + node * node_spread)
         o, d = unpack(tuple(ray[:3])), unpack(tuple(ray[3:]))
         X = point_on_ray(o, d, ray_to_ellipsoid(border, o, d))
         n = normal(border, X)
@@ -174,6 +176,6 @@ def apparent_point(
     if corrections.light_time:
         d = earlier_earth(d, -distance)
     if corrections.aberration:
-        seen = apparent_direction(d, inertial_velocity(P, V))
-        d = scale_vector(length(d) / length(seen), seen)
+        apparent = apparent_direction(d, inertial_velocity(P, V))
+        d = scale_vector(length(d) / length(apparent), apparent)
     return point_on_ray(P, d, 1.0)

@@ -54,11 +54,11 @@ def spread_positions(
     # Each row of cells deals its parts of the lines to its columns at random.
     turns = rng.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
     part = np.moveaxis(columns * np.arange(n)[:, None] + turns, 2, 1)
-    down = (part + rng.random(part.shape)) / (columns * n)
-    across = (np.arange(part.size).reshape(part.shape) * (np.sqrt(5) - 1) / 2) % 1
+    line_share = (part + rng.random(part.shape)) / (columns * n)
+    pixel_share = (np.arange(part.size).reshape(part.shape) * (np.sqrt(5) - 1) / 2) % 1
     row, column = np.arange(rows)[:, None, None], np.arange(columns)[:, None]
     place = lambda within, cell, count, size: (cell + within) * size / count - 0.5
-    return place(down, row, rows, lines), place(across, column, columns, pixels)
+    return place(line_share, row, rows, lines), place(pixel_share, column, columns, pixels)
 
 
 class GroundAccuracy(eqx.Module):
@@ -76,8 +76,8 @@ class GroundAccuracy(eqx.Module):
     @property
     def overall(self) -> float:
         """The RMS over all positions whose rays meet the surface; NaN if there are none."""
-        known = self.rms[np.isfinite(self.rms)]
-        return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
+        known_rms = self.rms[np.isfinite(self.rms)]
+        return float(np.sqrt(np.mean(known_rms**2))) if len(known_rms) else np.nan
 
 
 def propagate_accuracy(
@@ -98,8 +98,8 @@ def propagate_accuracy(
     covariance = np.asarray(_covariances(image, surface, lines, pixels, sigma))
     rms = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     ce90 = np.array([circular_error(c) for c in covariance])
-    known = np.isfinite(rms)
-    overall_ce90 = circular_error(covariance[known]) if known.any() else np.nan
+    is_known = np.isfinite(rms)
+    overall_ce90 = circular_error(covariance[is_known]) if is_known.any() else np.nan
     return GroundAccuracy(covariance, rms, ce90, overall_ce90)
 
 
@@ -118,12 +118,12 @@ def simulate_accuracy(
     covariance = np.einsum("dni,dnj->nij", errors, errors) / draws
     length = np.linalg.norm(errors, axis=2)
     rms = np.sqrt(np.mean(length**2, 0))
-    known = np.isfinite(rms)
+    is_known = np.isfinite(rms)
     return GroundAccuracy(
         covariance,
         rms,
         np.quantile(length, 0.9, axis=0),
-        float(np.quantile(length[:, known], 0.9)) if known.any() else np.nan,
+        float(np.quantile(length[:, is_known], 0.9)) if is_known.any() else np.nan,
     )
 
 
@@ -144,8 +144,8 @@ def closed_form(
     """The RMS over a line of a nadir-looking camera above a plane, for σ of its angles in
     radians."""
     V = np.tan(field_of_view / 2)
-    across = (1 + 2 * V**2 / 3 + V**4 / 5) * roll**2
-    return float(height * np.sqrt(across + pitch**2 + V**2 / 3 * yaw**2))
+    variance_across = (1 + 2 * V**2 / 3 + V**4 / 5) * roll**2
+    return float(height * np.sqrt(variance_across + pitch**2 + V**2 / 3 * yaw**2))
 
 
 def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -> float:
@@ -166,8 +166,8 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     # λ₂ = 0 leaves directions without extent; r²/1e-300 does not overflow and its exponential is 0
     stretch = np.maximum(stretch, 1e-300)
     # Ten times the largest σ is outside any fraction that double precision tells from 1.
-    outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
-    return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
+    excess_outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
+    return float(np.sqrt(large) * brentq(excess_outside, 0.0, 10.0))
 
 
 @partial(compile_once, static=())

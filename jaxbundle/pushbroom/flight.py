@@ -160,8 +160,8 @@ def _samples(flight: Flight, rate: float) -> Float[np.ndarray, " rows"]:
     Lagrange's polynomial of degree 7 takes four on either side; two more keep the edges of the
     image away from the ends of a spline.
     """
-    last, margin = flight.period * (flight.lines - 1), 6
-    return np.arange(-margin, np.ceil(last * rate) + margin + 1) / rate
+    last_line_time, margin = flight.period * (flight.lines - 1), 6
+    return np.arange(-margin, np.ceil(last_line_time * rate) + margin + 1) / rate
 
 
 def _position(flight: Flight, rate: float, method: str) -> TimeTable:
@@ -226,13 +226,13 @@ def arc_between(
     towards = np.stack([start, end]) - centre
     r = np.linalg.norm(towards, axis=1)
     u, v = towards / r[:, None]
-    across = np.linalg.norm(np.cross(u, v))
+    sine = np.linalg.norm(np.cross(u, v))
     # Below this the direction of w is lost in the rounding of coordinates.
-    if across < 1e-12:
+    if sine < 1e-12:
         where = "opposite places of the Earth" if u @ v < 0 else "above one place of the Earth"
         raise InputError(f"track: start and end are {where}, which gives no direction; give others")
-    w = (v - (u @ v) * u) / across
-    turn, climb = np.arctan2(across, u @ v) / duration, (r[1] - r[0]) / duration
+    w = (v - (u @ v) * u) / sine
+    turn, climb = np.arctan2(sine, u @ v) / duration, (r[1] - r[0]) / duration
     cos, sin = (f(turn * t)[:, None] for f in (np.cos, np.sin))
     distance = (r[0] + climb * t)[:, None]
     outward, forward = cos * u + sin * w, cos * w - sin * u

@@ -76,9 +76,9 @@ def make_footprint(
     heights = _heights(image, earth, settings.footprint_heights)
     if heights is None:
         return None
-    rows, across, layers = settings.footprint_lattice
+    rows, number_across, layers = settings.footprint_lattice
     times = np.linspace(float(pieces.ends[0]), float(pieces.ends[-1]), rows)
-    u = np.linspace(-0.5, image.pixels - 0.5, across)
+    u = np.linspace(-0.5, image.pixels - 0.5, number_across)
     xi, eta = (np.asarray(v) for v in slopes(image.optics, u))
     k, tau = _places(pieces, times)
     levels = np.linspace(heights[0], heights[1], layers)
@@ -95,14 +95,14 @@ def make_footprint(
     if reach is None:
         return None
     # Slopes of points of the footprint at all times, not only when they are seen.
-    xi = np.linspace(*reach, across)
+    xi = np.linspace(*reach, number_across)
     eta = np.polynomial.polynomial.polyval(xi, np.asarray(line))
     k, within = np.indices((len(pieces.ends) - 1, len(TESTED_POSITIONS))).reshape(2, -1)
     _, speed = speeds(k, TESTED_POSITIONS[within], xi, eta)
     speed = speed[np.isfinite(speed)]  # a ray that misses sees no point
-    same = speed.min() * speed.max() > 0
+    is_one_sign = speed.min() * speed.max() > 0
     steady = np.abs(speed).min() > settings.min_relative_speed * np.abs(speed).max()
-    return footprint if same and steady else None
+    return footprint if is_one_sign and steady else None
 
 
 def _heights(
@@ -111,11 +111,11 @@ def _heights(
     """The height range of points; None if the camera is not above the ground."""
     P = np.asarray(image.trajectory.position.values)
     if earth is None:
-        above = P[:, 2].min()
+        height_above = P[:, 2].min()
     else:
         # The residual of a point scaled from the surface by 1 + a is (1 + a)² − 1.
-        above = (np.sqrt(1 + np.asarray(residual(earth, tuple(P.T)))).min() - 1) * earth.c
-    return np.clip(limits, -above / 2, above / 2) if above > 0 else None
+        height_above = (np.sqrt(1 + np.asarray(residual(earth, tuple(P.T)))).min() - 1) * earth.c
+    return np.clip(limits, -height_above / 2, height_above / 2) if height_above > 0 else None
 
 
 def _places(
@@ -140,12 +140,12 @@ def _speeds_at(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sights D [times, slopes, heights, 3] and ∂F/∂t [times, slopes, heights] at many times."""
     ends = np.asarray(pieces.ends)
-    half = (ends[k + 1] - ends[k]) / 2
+    half_lengths = (ends[k + 1] - ends[k]) / 2
     c = np.asarray(pieces.coefficients)[k]
     pad = lambda a: np.pad(a, [(0, -len(k) % batch)] + [(0, 0)] * (a.ndim - 1), mode="edge")
     parts = [
         _speeds(*part, pieces.origin, xi, eta, heights, line, earth)
-        for part in zip(*(pad(a).reshape(-1, batch, *a.shape[1:]) for a in (c, tau, half)))
+        for part in zip(*(pad(a).reshape(-1, batch, *a.shape[1:]) for a in (c, tau, half_lengths)))
     ]
     D, speed = (np.concatenate([np.asarray(v) for v in values])[: len(k)] for values in zip(*parts))
     return D, speed
@@ -155,7 +155,7 @@ def _speeds_at(
 def _speeds(
     c: Float[AnyArray, "n 4 12"],
     tau: Float[AnyArray, " n"],
-    half: Float[AnyArray, " n"],
+    half_length: Float[AnyArray, " n"],
     origin: Float[AnyArray, "3"],
     xi: Float[np.ndarray, " slopes"],
     eta: Float[np.ndarray, " slopes"],
@@ -164,19 +164,24 @@ def _speeds(
     earth: Ellipsoid | None,
 ) -> tuple[Array, Scalar]:
     def speed_at(
-        c: Float[AnyArray, "4 12"], tau: Scalar, half: Scalar, xi: Scalar, eta: Scalar, h: Scalar
+        c: Float[AnyArray, "4 12"],
+        tau: Scalar,
+        half_length: Scalar,
+        xi: Scalar,
+        eta: Scalar,
+        h: Scalar,
     ) -> tuple[Array, Scalar]:
         numbers, rates = value_and_rate(c, tau)
         P, _ = motion(numbers, rates, origin)
         d = unpack(tuple(numbers[k] * xi + numbers[3 + k] * eta - numbers[6 + k] for k in range(3)))
         surface = Plane(level=h) if earth is None else Ground(at_height(earth, h))
         D = difference(point_on_ray(P, d, surface.distance(P, d)), origin)
-        speed = jax.jvp(lambda n: slope_ahead(n, D, line)[0], (numbers,), (rates / half,))[1]
+        speed = jax.jvp(lambda n: slope_ahead(n, D, line)[0], (numbers,), (rates / half_length,))[1]
         return jnp.stack(D), speed
 
     over_heights = jax.vmap(speed_at, (None, None, None, None, None, 0))
     over_slopes = jax.vmap(over_heights, (None, None, None, 0, 0, None))
-    return jax.vmap(over_slopes, (0, 0, 0, None, None, None))(c, tau, half, xi, eta, heights)
+    return jax.vmap(over_slopes, (0, 0, 0, None, None, None))(c, tau, half_length, xi, eta, heights)
 
 
 def _fit(
@@ -219,8 +224,8 @@ def _slope_range(
     if (-rsq[..., 2] < 0.1 * np.linalg.norm(rsq, axis=2)).any():
         return None
     xi = -rsq[..., 0] / rsq[..., 2]
-    middle, half = (xi.max() + xi.min()) / 2, (xi.max() - xi.min()) / 2
-    return middle - margin * half, middle + margin * half
+    middle, half_range = (xi.max() + xi.min()) / 2, (xi.max() - xi.min()) / 2
+    return middle - margin * half_range, middle + margin * half_range
 
 
 def _cubic(c: Float[AnyArray, "20"], x: Scalar, y: Scalar, z: Scalar) -> AnyArray:

@@ -222,10 +222,10 @@ def _map_chunks(
     if n <= size:
         return function(arrays)
     chunks = -(-n // size)
-    cut = lambda a: jnp.pad(a, (0, chunks * size - n), mode="edge").reshape(chunks, size)
-    found = jax.lax.map(function, tuple(cut(a) for a in arrays))
-    joined = lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n]
-    return jax.tree.map(joined, found)
+    in_chunks = lambda a: jnp.pad(a, (0, chunks * size - n), mode="edge").reshape(chunks, size)
+    results = jax.lax.map(function, tuple(in_chunks(a) for a in arrays))
+    join_chunks = lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n]
+    return jax.tree.map(join_chunks, results)
 
 
 def _find_positions(
@@ -242,19 +242,23 @@ def _find_positions(
     t, u, settled = refine(image, search, X, *start)
     # A position is known to be the only one in the image, between the heights, on this side of the
     # Earth; positions in the margin were not tested when the footprint was made.
-    once = settled & _inside(image, t, u, 0.0) & search.footprint.contains_height(search.earth, X)
-    once &= _above(search, X)
-    only = lambda v: jnp.full((most, v.size), jnp.nan).at[0].set(v)
-    count = once.astype(int)
-    found = Projected(only(image.times.line(t)), only(u), count, jnp.zeros_like(count))
+    is_once = (
+        settled & _is_inside(image, t, u, 0.0) & search.footprint.contains_height(search.earth, X)
+    )
+    is_once &= _is_above(search, X)
+    single = lambda v: jnp.full((most, v.size), jnp.nan).at[0].set(v)
+    count = is_once.astype(int)
+    positions = Projected(single(image.times.line(t)), single(u), count, jnp.zeros_like(count))
 
     def search_on(state: tuple[Projected, Array]) -> tuple[Projected, Array]:
-        found, known = state
-        chosen = first_of(~known, min(batch_size(*search.settings.searched_at_once), known.size))
-        few = _search(image, search, gather(X, chosen), most, margin)
-        return replace_chosen(found, few, chosen), known.at[chosen].set(True, mode="drop")
+        positions, is_known = state
+        rows = first_of(
+            ~is_known, min(batch_size(*search.settings.searched_at_once), is_known.size)
+        )
+        searched = _search(image, search, gather(X, rows), most, margin)
+        return replace_chosen(positions, searched, rows), is_known.at[rows].set(True, mode="drop")
 
-    return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (found, once))[0]
+    return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (positions, is_once))[0]
 
 
 def _search(
@@ -263,46 +267,66 @@ def _search(
     """The positions of arbitrary points."""
 
     def refine_passage(
-        found: tuple[Array, ...], args: tuple[Array, Array]
+        positions: tuple[Array, ...], args: tuple[Array, Array]
     ) -> tuple[tuple[Array, ...], None]:
-        line, pixel, number, lost = found
-        start, there = args
+        line, pixel, number, is_lost = positions
+        start, is_there = args
         middle = jnp.zeros_like(start) + (image.pixels - 1) / 2
         t, u, settled = jax.lax.cond(
-            jnp.any(there),
+            jnp.any(is_there),
             lambda: refine(image, search, X, start, middle),
             lambda: (start, start, start != start),
         )
-        seen = there & settled & _inside(image, t, u, margin)
-        here = seen & (number == jnp.arange(most)[:, None])
-        line = jnp.where(here, image.times.line(t), line)
-        return (line, jnp.where(here, u, pixel), number + seen, lost | (there & ~settled)), None
+        is_seen = is_there & settled & _is_inside(image, t, u, margin)
+        is_this = is_seen & (number == jnp.arange(most)[:, None])
+        line = jnp.where(is_this, image.times.line(t), line)
+        return (
+            line,
+            jnp.where(is_this, u, pixel),
+            number + is_seen,
+            is_lost | (is_there & ~settled),
+        ), None
 
     def search_on(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        *found, tried, _, _, _, _ = state
-        starts, count, *where = find_passages(image, search, X, most, margin, tried)
-        wanted = found[2] < most
-        there = (count > tried + jnp.arange(most)[:, None]) & wanted
+        *positions, passages_tried, _, _, _, _ = state
+        starts, count, *where = find_passages(image, search, X, most, margin, passages_tried)
+        is_wanted = positions[2] < most
+        is_there = (count > passages_tried + jnp.arange(most)[:, None]) & is_wanted
         # A loop: all passages share one compiled Newton's method.
-        found, _ = jax.lax.scan(refine_passage, tuple(found), (starts, there))
-        return *found, jnp.where(wanted, tried + most, tried), count, *where
+        positions, _ = jax.lax.scan(refine_passage, tuple(positions), (starts, is_there))
+        return (
+            *positions,
+            jnp.where(is_wanted, passages_tried + most, passages_tried),
+            count,
+            *where,
+        )
 
     def is_open(state: tuple[Array, ...]) -> Bool[Array, ""]:
-        _, _, number, _, tried, count, *_ = state
-        return jnp.any((number < most) & (tried < count))
+        _, _, number, _, passages_tried, count, *_ = state
+        return jnp.any((number < most) & (passages_tried < count))
 
     # The first passages may be beside the line of detectors, and later ones in the image: the
     # search goes on after them until the places are full or no passage is left.
-    none = jnp.zeros(jnp.shape(X[0]), int)
-    unknown, never = jnp.full((most, none.size), jnp.nan), none > 0
-    state = unknown, unknown, none, never, none, none + 1, never, never, never
+    zeros = jnp.zeros(jnp.shape(X[0]), int)
+    nan_positions, all_false = jnp.full((most, zeros.size), jnp.nan), zeros > 0
+    state = (
+        nan_positions,
+        nan_positions,
+        zeros,
+        all_false,
+        zeros,
+        zeros + 1,
+        all_false,
+        all_false,
+        all_false,
+    )
     state = jax.lax.while_loop(is_open, search_on, state)
-    line, pixel, number, lost, tried, count, ahead, behind, hidden = state
+    line, pixel, number, is_lost, passages_tried, count, ahead, behind, hidden = state
     # Passages after the last place were not refined: they may be outside the image.
-    number = number + jnp.maximum(count - tried, 0)
+    number = number + jnp.maximum(count - passages_tried, 0)
     # In the order of what explains most: hidden before lost, lost before beside.
     status = jnp.select(
-        [number > 0, hidden, lost, count > 0, ahead, behind],
+        [number > 0, hidden, is_lost, count > 0, ahead, behind],
         [
             jnp.asarray(int(s))
             for s in (
@@ -319,7 +343,7 @@ def _search(
     return Projected(line, pixel, number, status)
 
 
-def _inside(
+def _is_inside(
     image: ScannerGeometry,
     t: Float[AnyArray, " n"],
     u: Float[AnyArray, " n"],
@@ -327,11 +351,11 @@ def _inside(
 ) -> Bool[AnyArray, "..."]:
     """Whether positions are in the image, or outside by up to `margin` lines and pixels."""
     edge = 0.5 + margin
-    first, last = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
-    return (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
+    begin, end = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
+    return (t >= begin) & (t < end) & (u >= -edge) & (u < image.pixels - 1 + edge)
 
 
-def _above(search: Search, X: Vector) -> bool | Bool[AnyArray, " n"]:
+def _is_above(search: Search, X: Vector) -> bool | Bool[AnyArray, " n"]:
     """Whether the camera is above the horizon of the points at the middle of the image."""
     if search.earth is None:
         return jnp.ones(jnp.shape(X[0]), bool)

@@ -110,10 +110,11 @@ def check_size(lines: float, pixels: float, where: str) -> None:
     impossibly large."""
     # Ten million lines are 7000 km of pixels of 0.7 m: more is a slip of the pen.
     largest = 10_000_000
-    for size, name, least in ((lines, "lines", 1), (pixels, "pixels", 2)):
-        if not least <= size <= largest or size != int(size):
+    for size, name, smallest in ((lines, "lines", 1), (pixels, "pixels", 2)):
+        if not smallest <= size <= largest or size != int(size):
             raise InputError(
-                f"{where}: {size:.15g} {name}; a whole number from {least} to {largest} is expected"
+                f"{where}: {size:.15g} {name}; a whole number from {smallest} to {largest} is "
+                "expected"
             )
 
 

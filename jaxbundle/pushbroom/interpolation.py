@@ -118,8 +118,8 @@ def fraction(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
 def covers(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Bool[AnyArray, "..."]:
     """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
-    inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
-    return inside & (times[i + 1] - times[i] <= table.gap)
+    is_inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
+    return is_inside & (times[i + 1] - times[i] <= table.gap)
 
 
 def span(table: TimeTable) -> tuple[float, float]:
@@ -150,23 +150,25 @@ def spline_rates(
     ends = jnp.concatenate([jnp.array([True]), step > gap, jnp.array([True])])
     forward = _end_rows(step, slope, ends[1:])
     # Seen from behind, steps and slopes keep their signs.
-    back = _end_rows(step[::-1], slope[::-1], ends[-2::-1])
-    back = tuple(v[::-1] for v in back)
+    backward = _end_rows(step[::-1], slope[::-1], ends[-2::-1])
+    backward = tuple(v[::-1] for v in backward)
     zero, nothing = jnp.zeros(1), jnp.zeros((1, values.shape[1]))
-    before, after = jnp.concatenate([zero, step]), jnp.concatenate([step, zero])
+    step_before, step_after = jnp.concatenate([zero, step]), jnp.concatenate([step, zero])
     inner = 3 * (
-        after[:, None] * jnp.concatenate([nothing, slope])
-        + before[:, None] * jnp.concatenate([slope, nothing])
+        step_after[:, None] * jnp.concatenate([nothing, slope])
+        + step_before[:, None] * jnp.concatenate([slope, nothing])
     )
-    first, last = ends[:-1], ends[1:]
+    is_first, is_last = ends[:-1], ends[1:]
     choose = lambda at_first, at_last, within: jnp.where(
-        first, at_first, jnp.where(last, at_last, within)
+        is_first, at_first, jnp.where(is_last, at_last, within)
     )
-    right = jnp.where(first[:, None], forward[2], jnp.where(last[:, None], back[2], inner))
+    right = jnp.where(
+        is_first[:, None], forward[2], jnp.where(is_last[:, None], backward[2], inner)
+    )
     return tridiagonal_solve(
-        choose(0.0, back[1], after),
-        choose(forward[0], back[0], 2 * (before + after)),
-        choose(forward[1], 0.0, before),
+        choose(0.0, backward[1], step_after),
+        choose(forward[0], backward[0], 2 * (step_before + step_after)),
+        choose(forward[1], 0.0, step_before),
         right,
     )
 
@@ -174,26 +176,28 @@ def spline_rates(
 def _end_rows(
     step: Float[Array, " intervals"],
     slope: Float[Array, "intervals k"],
-    last: Bool[Array, " intervals"],
+    is_end: Bool[Array, " intervals"],
 ) -> tuple[Array, Array, Array]:
     """Diagonal, coefficient of the next rate and right-hand side of each row as the first one.
 
-    `last` tells where a spline ends: not-a-knot needs four rows.
+    `is_end` tells where a spline ends: not-a-knot needs four rows.
     """
     pad = lambda v, by: jnp.concatenate([v[by:], jnp.ones((1 + by, *v.shape[1:]))])
     h0, h1, s0, s1 = pad(step, 0), pad(step, 1), pad(slope, 0), pad(slope, 1)
-    both = h0 + h1
+    both_steps = h0 + h1
     # Not-a-knot: the third derivative is continuous at the second row, which combined with its own
     # equation leaves h₁·ẏ₀ + (h₀ + h₁)·ẏ₁ = knot (de Boor, 1978, chapter IV).
-    knot = (((h0 + 2 * both) * h1)[:, None] * s0 + (h0**2)[:, None] * s1) / both[:, None]
-    parabola = s0 - (h0 / both)[:, None] * (s1 - s0)
-    ending = lambda by: jnp.concatenate([last[by:], jnp.ones(by, bool)])
+    knot = (((h0 + 2 * both_steps) * h1)[:, None] * s0 + (h0**2)[:, None] * s1) / both_steps[
+        :, None
+    ]
+    parabola = s0 - (h0 / both_steps)[:, None] * (s1 - s0)
+    ending = lambda by: jnp.concatenate([is_end[by:], jnp.ones(by, bool)])
     two, three = ending(1), ending(2)
-    short = last | two | three
+    short = is_end | two | three
     right = jnp.where(
-        last[:, None], 0.0, jnp.where(two[:, None], s0, jnp.where(three[:, None], parabola, knot))
+        is_end[:, None], 0.0, jnp.where(two[:, None], s0, jnp.where(three[:, None], parabola, knot))
     )
-    return jnp.where(short, 1.0, h1), jnp.where(short, 0.0, both), right
+    return jnp.where(short, 1.0, h1), jnp.where(short, 0.0, both_steps), right
 
 
 def _chebyshev(nodes: int) -> np.ndarray:
@@ -205,35 +209,35 @@ def _evaluate_piece(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[
     """Lagrange's formula through the nodes of Chebyshev, which are the same in every interval."""
     pieces = not_none(table.pieces)
     nodes = _chebyshev(pieces.shape[1])
-    same = np.eye(len(nodes), dtype=bool)
-    spans = nodes[:, None] - nodes + same
+    is_same = np.eye(len(nodes), dtype=bool)
+    spans = nodes[:, None] - nodes + is_same
     tau = fraction(table, i, t)
-    return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ pieces[i]
+    return jnp.prod(jnp.where(is_same, 1.0, (tau - nodes) / spans), axis=1) @ pieces[i]
 
 
 def _lagrange(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
     """Lagrange's formula through order + 1 rows: half of them before t, except at the ends."""
     rows = table.order + 1
-    first = jnp.clip(i + 1 - rows // 2, 0, len(table.times) - rows)
-    times = jax.lax.dynamic_slice_in_dim(table.times, first, rows)
-    values = jax.lax.dynamic_slice_in_dim(table.values, first, rows)
-    same = jnp.eye(rows, dtype=bool)
-    spans = times[:, None] - times + same
-    return jnp.prod(jnp.where(same, 1.0, (t - times) / spans), axis=1) @ values
+    first_row = jnp.clip(i + 1 - rows // 2, 0, len(table.times) - rows)
+    times = jax.lax.dynamic_slice_in_dim(table.times, first_row, rows)
+    values = jax.lax.dynamic_slice_in_dim(table.values, first_row, rows)
+    is_same = jnp.eye(rows, dtype=bool)
+    spans = times[:, None] - times + is_same
+    return jnp.prod(jnp.where(is_same, 1.0, (t - times) / spans), axis=1) @ values
 
 
 def _usgscsm(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
     """Lagrange's formula through 2·half rows, with weights 0 for the rest of a fixed number."""
-    most = (table.order + 1) // 2
-    half = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), most)
-    offset = jnp.arange(-most, most) + 1
-    used = (offset > -half) & (offset <= half)
+    half_window = (table.order + 1) // 2
+    half_rows = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), half_window)
+    offset = jnp.arange(-half_window, half_window) + 1
+    is_used = (offset > -half_rows) & (offset <= half_rows)
     row = jnp.clip(i + offset, 0, len(table.times) - 1)
     times, values = table.times[row], table.values[row]
-    factor = ~jnp.eye(2 * most, dtype=bool) & used & used[:, None]
+    factor = ~jnp.eye(2 * half_window, dtype=bool) & is_used & is_used[:, None]
     spans = jnp.where(factor, times[:, None] - times, 1.0)
     weights = jnp.prod(jnp.where(factor, (t - times) / spans, 1.0), axis=1)
-    return jnp.where(used, weights, 0.0) @ values
+    return jnp.where(is_used, weights, 0.0) @ values
 
 
 def _hermite(

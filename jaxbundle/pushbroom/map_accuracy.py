@@ -69,17 +69,25 @@ def covariance_lattice(
     levels = np.linspace(low, max(high, low + 1.0), size[0])
     lines = np.linspace(0, image.lines - 1, size[1])
     pixels = np.linspace(0, image.pixels - 1, size[2])
-    every = np.repeat(lines, size[2]), np.tile(pixels, size[1])
-    found = []
+    line_and_pixel = np.repeat(lines, size[2]), np.tile(pixels, size[1])
+    by_level = []
     for level in levels:
-        given = image, earth, level, *every, errors.image, errors.height, errors.ground
-        sigma = np.array(_ground_covariances(*given))
+        covariance_inputs = (
+            image,
+            earth,
+            level,
+            *line_and_pixel,
+            errors.image,
+            errors.height,
+            errors.ground,
+        )
+        sigma = np.array(_ground_covariances(*covariance_inputs))
         if isinstance(image, PushbroomImage) and any(np.any(s) for s in errors.noise):
             surface = Plane(level=level) if earth is None else Height(level=level, earth=earth)
-            sigma += propagate_accuracy(image, surface, *every, errors.noise).covariance
+            sigma += propagate_accuracy(image, surface, *line_and_pixel, errors.noise).covariance
         parts = sigma[:, 0, 0], sigma[:, 1, 1], sigma[:, 0, 1]
-        found.append(np.stack(parts).reshape(3, *size[1:]))
-    return CovarianceLattice(levels, lines, pixels, np.stack(found, 1))
+        by_level.append(np.stack(parts).reshape(3, *size[1:]))
+    return CovarianceLattice(levels, lines, pixels, np.stack(by_level, 1))
 
 
 @partial(compile_once, static=1)
@@ -141,5 +149,7 @@ def _interpolate(
         (value - axis[0]) / (axis[1] - axis[0]) for value, axis in zip((height, line, pixel), axes)
     ]
     # Of order 1: multilinear; half a pixel beyond the outer centres they are extended.
-    of = lambda part: jax.scipy.ndimage.map_coordinates(part, places, order=1, mode="nearest")
-    return jnp.stack([of(part) for part in lattice.values])
+    interpolated = lambda part: jax.scipy.ndimage.map_coordinates(
+        part, places, order=1, mode="nearest"
+    )
+    return jnp.stack([interpolated(part) for part in lattice.values])

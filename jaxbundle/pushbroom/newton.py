@@ -36,30 +36,32 @@ def refine(
 ) -> tuple[AnyArray, AnyArray, Array]:
     """(t, u, settled) of points X, a triple of arrays [n], from times and pixels near by."""
     ends, settings = search.pieces.ends, search.settings
-    far = settings.max_distance * image.line_period
+    distance_in_time = settings.max_distance * image.line_period
     n = t.size
-    few = min(n, batch_size(*settings.gathered_at_once))
+    batch = min(n, batch_size(*settings.gathered_at_once))
 
     def is_open(state: RefinementState) -> Bool[Array, " n"]:
         t, _, settled, rounds = state
-        near = (t >= ends[0] - far) & (t <= ends[-1] + far)
-        return ~settled & near & (rounds < settings.max_rounds)
+        is_near = (t >= ends[0] - distance_in_time) & (t <= ends[-1] + distance_in_time)
+        return ~settled & is_near & (rounds < settings.max_rounds)
 
     def advance_all(state: RefinementState) -> RefinementState:
-        wanted, (*place, settled, rounds) = is_open(state), state
-        found = _make_round(image, search, X, *place)
-        t, u, settled = (jnp.where(wanted, a, b) for a, b in zip(found, (*place, settled)))
-        return t, u, settled, rounds + wanted
+        is_wanted, (*place, settled, rounds) = is_open(state), state
+        round_result = _make_round(image, search, X, *place)
+        t, u, settled = (
+            jnp.where(is_wanted, a, b) for a, b in zip(round_result, (*place, settled))
+        )
+        return t, u, settled, rounds + is_wanted
 
     def advance_few(state: RefinementState) -> RefinementState:
         *place, settled, rounds = state
-        chosen = first_of(is_open(state), few)
-        found = _make_round(image, search, *gather((X, *place), chosen))
-        changed = replace_chosen((*place, settled), found, chosen)
-        return *changed, rounds.at[chosen].add(1, mode="drop")
+        rows = first_of(is_open(state), batch)
+        round_result = _make_round(image, search, *gather((X, *place), rows))
+        changed = replace_chosen((*place, settled), round_result, rows)
+        return *changed, rounds.at[rows].add(1, mode="drop")
 
     def advance(state: RefinementState) -> RefinementState:
-        if n == few:
+        if n == batch:
             return advance_all(state)
         # Gathering and scattering beats a round of all points only for few of them: a larger part
         # would be gathered batch by batch, a smaller one recomputes settled points. Not critical.
@@ -70,21 +72,21 @@ def refine(
     return jax.lax.while_loop(lambda s: jnp.any(is_open(s)), advance, state)[:3]
 
 
-def first_of(wanted: Bool[Array, " n"], few: int) -> Int[Array, " few"]:
-    """The indices of the first `few` that are wanted; n where there are fewer."""
-    return jnp.nonzero(wanted, size=few, fill_value=wanted.size)[0]
+def first_of(is_wanted: Bool[Array, " n"], number: int) -> Int[Array, " few"]:
+    """The indices of the first `number` that are wanted; n where there are fewer."""
+    return jnp.nonzero(is_wanted, size=number, fill_value=is_wanted.size)[0]
 
 
-def gather(arrays: PyTree[Array], chosen: Int[Array, " few"]) -> PyTree[Array]:
+def gather(arrays: PyTree[Array], rows: Int[Array, " few"]) -> PyTree[Array]:
     """Arrays [n] at indices; any value for n."""
-    return jax.tree.map(lambda a: a.at[chosen].get(mode="clip"), arrays)
+    return jax.tree.map(lambda a: a.at[rows].get(mode="clip"), arrays)
 
 
 def replace_chosen(
-    arrays: PyTree[Array], values: PyTree[Array], chosen: Int[Array, " few"]
+    arrays: PyTree[Array], values: PyTree[Array], rows: Int[Array, " few"]
 ) -> PyTree[Array]:
     """Arrays [..., n] with values [..., few] at indices; those of n are dropped."""
-    return jax.tree.map(lambda a, v: a.at[..., chosen].set(v, mode="drop"), arrays, values)
+    return jax.tree.map(lambda a, v: a.at[..., rows].set(v, mode="drop"), arrays, values)
 
 
 def _make_round(
@@ -101,18 +103,18 @@ def _make_round(
     the inverse of 2 × 2 written out.
     """
     pieces, settings = search.pieces, search.settings
-    last = len(pieces.ends) - 2
+    last_piece = len(pieces.ends) - 2
     piece = jnp.searchsorted(pieces.ends[1:-1], t, side="right")
     in_piece = lambda a: a.at[piece].get(mode="promise_in_bounds")
     start, end = in_piece(pieces.ends[:-1]), in_piece(pieces.ends[1:])
-    middle, half = (start + end) / 2, (end - start) / 2
-    tau = first = (t - middle) / half
+    middle, half_length = (start + end) / 2, (end - start) / 2
+    tau = first_tau = (t - middle) / half_length
     # One vector of each coefficient: a gather that goes into the arithmetic.
     c = [[in_piece(a) for a in power] for power in pieces.coefficients.transpose(1, 2, 0)]
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
-        moved = motion(numbers, [r / half for r in rates], pieces.origin)
-        X = image.apparent_position(search.earth, moved, X)
+        numbers_and_rates = motion(numbers, [r / half_length for r in rates], pieces.origin)
+        X = image.apparent_position(search.earth, numbers_and_rates, X)
         # Otherwise XLA recomputes it for each of the twelve sums below.
         X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)
@@ -121,7 +123,7 @@ def _make_round(
     (xi, eta), (xi1, eta1) = image.optics.slopes(u), image.optics.slopes(u + 1)
     ft, gt, fu, gu = dr + xi * dq, ds + eta * dq, (xi1 - xi) * q, (eta1 - eta) * q
     inverse = 1 / (ft * gu - fu * gt)
-    line = image.line_period / half
+    line = image.line_period / half_length
     step, v = jnp.inf, u
     for k in range(settings.steps_per_round):
         if k:
@@ -130,18 +132,18 @@ def _make_round(
         f, g = r + xi * q, s + eta * q
         dtau, dv = inverse * (gu * f - fu * g), inverse * (ft * g - gt * f)
         tau, v = tau - dtau, v - dv
-        before, step = step, jnp.maximum(jnp.abs(dtau) / line, jnp.abs(dv))
+        previous_step, step = step, jnp.maximum(jnp.abs(dtau) / line, jnp.abs(dv))
     # Steps that shrink by step/before each leave about step²/before (geometric series). The second
     # term lets a start at the solution settle, whose steps are rounding and do not shrink.
     tolerance = settings.position_tolerance
-    settled = (step * step <= tolerance * (before + tolerance)) & (q < 0)
+    settled = (step * step <= tolerance * (previous_step + tolerance)) & (q < 0)
     if image.corrections.any:
         # The sight refers to the time at the start of the round.
-        settled &= jnp.abs(tau - first) < settings.sight_tolerance * line
+        settled &= jnp.abs(tau - first_tau) < settings.sight_tolerance * line
     # A root exactly at the end of a piece would alternate.
     reach = 1 + settings.piece_overlap * line
-    settled &= ((tau >= -reach) | (piece == 0)) & ((tau <= reach) | (piece == last))
-    return middle + tau * half, v, settled
+    settled &= ((tau >= -reach) | (piece == 0)) & ((tau <= reach) | (piece == last_piece))
+    return middle + tau * half_length, v, settled
 
 
 def _component(numbers: Sequence[Scalar], D: Triple, i: int) -> Scalar:

@@ -52,7 +52,7 @@ def state_orbit(
         when = np.sort(times[part])[::order]
         if not len(when):
             continue
-        found = solve_ivp(
+        solution = solve_ivp(
             lambda _, y: np.r_[y[3:], acceleration(y[:3], j2)],
             (at, when[-1]),
             start,
@@ -62,17 +62,18 @@ def state_orbit(
             atol=tolerance * np.r_[np.full(3, 1e7), np.full(3, 1e4)],
             events=_ground,
         )
-        if found.status:
+        if solution.status:
             raise InputError(
-                f"state: the orbit reaches the ground at {found.t_events[0][0]:.6g} s; check the "
+                f"state: the orbit reaches the ground at {solution.t_events[0][0]:.6g} s; check "
+                "the "
                 "velocity, its unit and frame"
             )
         # Times need not be sorted, but those of the integration are.
-        states[part] = found.y.T[np.searchsorted(order * when, order * times[part])]
+        states[part] = solution.y.T[np.searchsorted(order * when, order * times[part])]
     # From the axes at the epoch to those that have turned since.
-    back = Rotation.from_euler("z", -EARTH_RATE * (times - at)[:, None])
-    P = back.apply(states[:, :3])
-    return P, back.apply(states[:, 3:]) - np.cross(spin, P)
+    to_earth = Rotation.from_euler("z", -EARTH_RATE * (times - at)[:, None])
+    P = to_earth.apply(states[:, :3])
+    return P, to_earth.apply(states[:, 3:]) - np.cross(spin, P)
 
 
 def acceleration(r: Float[np.ndarray, "3"], j2: bool = True) -> Float[np.ndarray, "3"]:

@@ -32,33 +32,32 @@ def find_passages(
     image: ScannerGeometry,
     search: Search,
     X: Vector,
-    most: int,
+    max_passages: int,
     margin: float | Array,
     passed_over: Int[Array, " n"],
 ) -> Passages:
     """Approximate times of passages over the points, and their number; whether points are
     ahead of the last line, behind the first, or never above the horizon.
 
-    The times are those of the first `most` passages after `passed_over` ones; the number is that
-    of all. The search begins and ends one line outside the image, to include its edges.
-    """
+    The times are those of the first `max_passages` passages after `passed_over` ones; the number is
+    that of all. The search begins and ends one line outside the image, to include its edges."""
     step = (1 + margin) * image.line_period
     samples = jnp.asarray(search.samples).at[0].add(-step).at[-1].add(step)
     numbers, rates, motions = jax.vmap(partial(sample, search.pieces))(samples)
-    up = None if search.earth is None else normal(search.earth, X)
+    vertical = None if search.earth is None else normal(search.earth, X)
 
     def step_to(state: PassagesState, sample: SearchStep) -> tuple[PassagesState, None]:
-        before, rate_before, t_before, count, starts, first, risen = state
+        previous, rate_before, t_before, count, starts, first_value, risen = state
         k, t, numbers, rates, motion = sample
         D = difference(image.apparent_position(search.earth, motion, X), search.pieces.origin)
         ahead = lambda numbers: slope_ahead(numbers, D, search.detector_line)[0]
         value, rate = jax.jvp(ahead, (numbers,), (rates,))
-        if up is not None:
-            above = dot(up, difference(motion[0], X)) > 0
-            value, risen = jnp.where(above, value, jnp.nan), risen | above
+        if vertical is not None:
+            is_above = dot(vertical, difference(motion[0], X)) > 0
+            value, risen = jnp.where(is_above, value, jnp.nan), risen | is_above
         h = t - t_before
-        once, twice, places = _find_zeros(before, value, rate_before * h, rate * h)
-        new = once + 2 * twice
+        is_once, is_twice, places = _find_zeros(previous, value, rate_before * h, rate * h)
+        new = is_once + 2 * is_twice
         starts = tuple(
             jnp.select(
                 [(count + j == i) & (new > j) for j in range(2)],
@@ -67,8 +66,8 @@ def find_passages(
             )
             for i, start in enumerate(starts)
         )
-        first = jnp.where(k == 0, value, first)
-        return (value, rate, t, count + new, starts, first, risen), None
+        first_value = jnp.where(k == 0, value, first_value)
+        return (value, rate, t, count + new, starts, first_value, risen), None
 
     zero = jnp.zeros_like(X[0])
     nowhere, never = zero * jnp.nan, zero > 1
@@ -77,18 +76,18 @@ def find_passages(
         zero,
         samples[0],
         -passed_over,
-        (zero,) * most,
+        (zero,) * max_passages,
         nowhere,
-        never if up is not None else ~never,
+        never if vertical is not None else ~never,
     )
     # Four steps of plain sights a turn hide the cost of the loop; steps with corrections are long
     # enough, and four of them only take longer to compile.
     unroll = 1 if image.corrections.any else 4
-    (final, _, _, further, starts, first, risen), _ = jax.lax.scan(
+    (final, _, _, further, starts, first_value, risen), _ = jax.lax.scan(
         step_to, state, (jnp.arange(len(samples)), samples, numbers, rates, motions), unroll=unroll
     )
     # NaN at an end, where the point is behind the camera, is neither ahead nor behind
-    return jnp.stack(starts), further + passed_over, final > 0, first < 0, ~risen
+    return jnp.stack(starts), further + passed_over, final > 0, first_value < 0, ~risen
 
 
 def _find_zeros(
@@ -96,10 +95,10 @@ def _find_zeros(
 ) -> tuple[Array, Array, tuple[Array, Array]]:
     """Whether a function crosses zero once or twice from 0 to 1, and approximately where; from its
     values and rates at both ends (cubic), false if one is NaN."""
-    known = ~(jnp.isnan(a) | jnp.isnan(b))
-    once = known & ((a >= 0) != (b >= 0))
-    straight = a / jnp.where(once, a - b, 1.0)
-    turns = known & ~once & (a * da < 0) & (b * db > 0)
+    is_known = ~(jnp.isnan(a) | jnp.isnan(b))
+    is_once = is_known & ((a >= 0) != (b >= 0))
+    single_zero = a / jnp.where(is_once, a - b, 1.0)
+    turns = is_known & ~is_once & (a * da < 0) & (b * db > 0)
     # The zero of the rate, c + 2h·s + k·s², between ends of different sign; q avoids the
     # cancellation of −h ± √(h² − ck) (Press et al., 2007, Numerical Recipes, section 5.6).
     rise = b - a
@@ -111,5 +110,5 @@ def _find_zeros(
     twice = turns & ((turn >= 0) != (a >= 0))
     # A parabola on each side of the turn.
     part = lambda end: jnp.sqrt(turn / jnp.where(twice, turn - end, 1.0))
-    before, after = s * (1 - part(a)), s + (1 - s) * part(b)
-    return once, twice, (jnp.where(once, straight, before), after)
+    first_zero, second_zero = s * (1 - part(a)), s + (1 - s) * part(b)
+    return is_once, twice, (jnp.where(is_once, single_zero, first_zero), second_zero)

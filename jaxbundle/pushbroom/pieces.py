@@ -70,66 +70,67 @@ def make_pieces(
 
     **Raises:** `InputError` if no pieces represent the trajectory.
     """
-    first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
-    line = (last - first) / image.lines
+    begin, end = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    line = (end - begin) / image.lines
     tables = image.trajectory.position, image.trajectory.attitude.table
     starts, ends = zip(*(span(table) for table in tables))
-    first, last = max(first, *starts), min(last, *ends)
+    begin, end = max(begin, *starts), min(end, *ends)
     nodes = np.unique(np.concatenate([breaks(table) for table in tables]))
     equal = settings.equal_times * line
-    nodes = nodes[(nodes > first + equal) & (nodes < last - equal)]
-    ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > equal], last]
+    nodes = nodes[(nodes > begin + equal) & (nodes < end - equal)]
+    ends = np.r_[begin, nodes[np.diff(nodes, prepend=-np.inf) > equal], end]
     origin, reach, per_radian = _middle_sight(image, earth)
-    left, right, found = ends[:-1], ends[1:], []
-    while len(left):
+    piece_starts, piece_ends, pieces = ends[:-1], ends[1:], []
+    while len(piece_starts):
         values, checks = _pose_numbers_of_pieces(
-            image, origin, left, right, (first, last), settings.times_at_once
+            image, origin, piece_starts, piece_ends, (begin, end), settings.times_at_once
         )
         wrong = np.abs(TO_CHECKS @ values - checks)
         # Turns act on the whole sight, shifts over its length.
         error = per_radian * (wrong[..., :9].max((1, 2)) + wrong[..., 9:].max((1, 2)) / reach)
         good = error <= settings.piece_tolerance
-        found += zip(left[good], right[good], TO_COEFFICIENTS @ values[good])
+        pieces += zip(piece_starts[good], piece_ends[good], TO_COEFFICIENTS @ values[good])
         # A rough trajectory, or a wrong row, would be halved for ever.
-        left, right = left[~good], right[~good]
-        if len(left) and (right - left).min() < settings.min_piece * line:
+        piece_starts, piece_ends = piece_starts[~good], piece_ends[~good]
+        if len(piece_starts) and (piece_ends - piece_starts).min() < settings.min_piece * line:
             raise InputError(
-                f"attitude: the trajectory at {left[0]:.9g} s does not follow from its rows within "
+                f"attitude: the trajectory at {piece_starts[0]:.9g} s does not follow from its "
+                "rows within "
                 f"{settings.min_piece:g} lines; look for wrong rows there"
             )
-        middle = (left + right) / 2
-        left, right = np.r_[left, middle], np.r_[middle, right]
-    shared = len(found) <= settings.max_shared_pieces
-    more = round_up(len(found)) - len(found) if shared else 0
+        middle = (piece_starts + piece_ends) / 2
+        piece_starts, piece_ends = np.r_[piece_starts, middle], np.r_[middle, piece_ends]
+    shared = len(pieces) <= settings.max_shared_pieces
+    number_added = round_up(len(pieces)) - len(pieces) if shared else 0
     # A half has the same polynomial: pieces that only fill up move no position.
-    found = _halve_some(found, more)
-    coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
+    pieces = _halve_some(pieces, number_added)
+    coefficients = jnp.asarray(np.stack([piece[2] for piece in pieces]))
     return Pieces(
-        jnp.asarray(np.r_[[p[0] for p in found], last]), coefficients, jnp.asarray(origin)
+        jnp.asarray(np.r_[[p[0] for p in pieces], end]), coefficients, jnp.asarray(origin)
     )
 
 
 def _halve_some(pieces: list[Piece], number: int) -> list[Piece]:
     """Pieces (start, end, coefficients) in order of time, some of the longest halved."""
     pieces = sorted(pieces, key=lambda piece: piece[1] - piece[0])
-    whole, long = pieces[: len(pieces) - number], pieces[len(pieces) - number :]
+    unhalved, long = pieces[: len(pieces) - number], pieces[len(pieces) - number :]
     for start, end, c in long:
         middle = (start + end) / 2
-        whole += [(start, middle, TO_HALVES[0] @ c), (middle, end, TO_HALVES[1] @ c)]
-    return sorted(whole, key=lambda piece: piece[0])
+        unhalved += [(start, middle, TO_HALVES[0] @ c), (middle, end, TO_HALVES[1] @ c)]
+    return sorted(unhalved, key=lambda piece: piece[0])
 
 
 def _pose_numbers_of_pieces(
     image: PushbroomImage,
     origin: Float[np.ndarray, "3"],
-    left: Float[np.ndarray, " n"],
-    right: Float[np.ndarray, " n"],
+    piece_starts: Float[np.ndarray, " n"],
+    piece_ends: Float[np.ndarray, " n"],
     span: tuple[float, float],
     batch: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The twelve numbers at nodes and checks of many pieces: [n, 4, 12] and [n, 5, 12]."""
     places = np.r_[NODES, CHECKS]
-    t = (left + right)[:, None] / 2 + (right - left)[:, None] / 2 * places
+    t = (piece_starts + piece_ends)[:, None] / 2 + (piece_ends - piece_starts)[:, None] / 2 * places
     t = np.clip(t, *span)
     padded = np.pad(t.ravel(), (0, -t.size % batch), mode="edge").reshape(-1, batch)
     numbers = np.concatenate([_pose_numbers(image, origin, times) for times in padded])
@@ -148,20 +149,22 @@ def _pose_numbers(
     return jax.vmap(numbers_at)(times)
 
 
-def sample_times(pieces: Pieces, most: int) -> Float[AnyArray, " k"]:
-    """Ends of pieces, `most` steps at most."""
-    last = len(pieces.ends) - 1
-    chosen = np.unique(np.linspace(0, last, min(most, last) + 1).round().astype(int))
-    return pieces.ends[chosen]
+def sample_times(pieces: Pieces, max_steps: int) -> Float[AnyArray, " k"]:
+    """Ends of pieces, `max_steps` steps at most."""
+    last_piece = len(pieces.ends) - 1
+    ends_chosen = np.unique(
+        np.linspace(0, last_piece, min(max_steps, last_piece) + 1).round().astype(int)
+    )
+    return pieces.ends[ends_chosen]
 
 
 def sample(pieces: Pieces, t: Scalar) -> tuple[Array, Array, tuple[Triple, Triple]]:
     """The twelve numbers at a time, their rates, and (P, V)."""
     k = jnp.searchsorted(pieces.ends[1:-1], t, side="right")
     start, end, c = pieces.ends[k], pieces.ends[k + 1], pieces.coefficients[k]
-    half = (end - start) / 2
-    numbers, rates = value_and_rate(c, (t - start) / half - 1)
-    return numbers, rates / half, motion(numbers, rates / half, pieces.origin)
+    half_length = (end - start) / 2
+    numbers, rates = value_and_rate(c, (t - start) / half_length - 1)
+    return numbers, rates / half_length, motion(numbers, rates / half_length, pieces.origin)
 
 
 def motion(

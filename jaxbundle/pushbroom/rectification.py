@@ -122,8 +122,8 @@ def block_places(
     if occlusion and isinstance(surface, Terrain):
         hidden = _hidden(image, search, surface, nodes, heights.height, (line, pixel))
         line = jnp.where(hidden, jnp.nan, line)
-    found = _keep_inside(image, np.asarray(line), np.asarray(pixel))
-    return found if np.isfinite(found.line).any() else None
+    inside = _keep_inside(image, np.asarray(line), np.asarray(pixel))
+    return inside if np.isfinite(inside.line).any() else None
 
 
 class BlockHeights(NamedTuple):
@@ -151,8 +151,8 @@ def _interpolated_places(
     # A terrain model without a height here.
     if not np.isfinite(h).all():
         return None
-    for every in (2, 1):
-        X, vertical = (a[:, None, ::every, ::every] for a in nodes)
+    for node_step in (2, 1):
+        X, vertical = (a[:, None, ::node_step, ::node_step] for a in nodes)
         values = np.asarray(project(X + h[:, None, None] * vertical))
         if np.isfinite(values).all():
             if _is_beside(image, values):
@@ -185,13 +185,13 @@ def _fit_heights(
     """The coefficients a₀, a₁, a₂ at the nodes, and the largest error where they are tested."""
     low, lower, middle, upper, high = jnp.moveaxis(values, 1, 0)
     a = middle, (high - low) / 2, (high + low) / 2 - middle
-    at = lambda t: a[0] + t * (a[1] + t * a[2])
-    bend = jnp.maximum(jnp.abs(at(-0.5) - lower).max(), jnp.abs(at(0.5) - upper).max())
+    value_at = lambda t: a[0] + t * (a[1] + t * a[2])
+    bend = jnp.maximum(jnp.abs(value_at(-0.5) - lower).max(), jnp.abs(value_at(0.5) - upper).max())
     n = values.shape[-1]
     weights = hat_functions(n, 2)
     coarse = values[..., ::2, ::2].reshape(-1, n // 2 + 1, n // 2 + 1)
-    between = jnp.einsum("ri,kij,cj->krc", weights, coarse, weights).reshape(values.shape)
-    return jnp.stack(a, 1), bend + jnp.abs(between - values).max()
+    interpolated = jnp.einsum("ri,kij,cj->krc", weights, coarse, weights).reshape(values.shape)
+    return jnp.stack(a, 1), bend + jnp.abs(interpolated - values).max()
 
 
 @partial(compile_once, static=())
@@ -202,7 +202,9 @@ def _evaluate(
     n = coefficients.shape[-1]
     t = (heights.height - heights.middle) / heights.half
     a0, a1, a2 = jnp.moveaxis(
-        _spread(coefficients.reshape(6, n, n)).reshape(2, 3, BLOCK_SIZE, BLOCK_SIZE), 1, 0
+        _interpolate_nodes(coefficients.reshape(6, n, n)).reshape(2, 3, BLOCK_SIZE, BLOCK_SIZE),
+        1,
+        0,
     )
     line, pixel = a0 + t * (a1 + t * a2)
     return line, pixel
@@ -215,8 +217,8 @@ def _find_starts(
     # Start values only: between the heights of terrain an image position moves by pixels.
     raised = nodes.X + np.asarray(_level(surface)) * nodes.up
     # Nodes up to 512 lines and pixels outside have positions too, so that they enclose its edges.
-    found = project_points(image, search, raised.reshape(3, -1), margin=2.0 * BLOCK_SIZE)
-    starts = np.stack([found.line[0], found.pixel[0]])
+    projected = project_points(image, search, raised.reshape(3, -1), margin=2.0 * BLOCK_SIZE)
+    starts = np.stack([projected.line[0], projected.pixel[0]])
     if not np.isfinite(starts[0]).any():
         return None
     return _fill_unseen_nodes(starts.reshape(2, *nodes.X.shape[1:]))
@@ -231,11 +233,11 @@ def _scanner_places(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions of all pixels of a block in a rigorous image, each projected."""
     line, pixel, ground = map(np.asarray, _places(scanner_of(image), search, nodes, height, starts))
-    lost = np.isnan(line) & np.isfinite(ground[0])
-    if lost.any():
+    is_lost = np.isnan(line) & np.isfinite(ground[0])
+    if is_lost.any():
         # On a rough trajectory the interpolated start may not converge.
         line, pixel = line.copy(), pixel.copy()
-        line[lost], pixel[lost] = _search(image, search, ground[:, lost], starts[0].size)
+        line[is_lost], pixel[is_lost] = _search(image, search, ground[:, is_lost], starts[0].size)
     return line, pixel
 
 
@@ -261,9 +263,9 @@ def _keep_inside(
     pixel: Float[np.ndarray, "rows columns"],
 ) -> Places:
     """Positions outside the image become NaN."""
-    inside = (line >= -0.5) & (line < image.lines - 0.5)
-    inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
-    return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
+    is_inside = (line >= -0.5) & (line < image.lines - 0.5)
+    is_inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
+    return Places(np.where(is_inside, line, np.nan), np.where(is_inside, pixel, np.nan))
 
 
 @partial(compile_once, static=())
@@ -286,8 +288,8 @@ def _project_near(
     starts: Float[AnyArray, "2 m m"],
 ) -> Float[Array, "2 heights n n"]:
     """Positions of points above nodes in a rigorous image, from those of the nodes."""
-    every = (starts.shape[-1] - 1) // (X.shape[-1] - 1)
-    start = jnp.broadcast_to(starts[:, None, ::every, ::every], (2, *X.shape[1:]))
+    node_step = (starts.shape[-1] - 1) // (X.shape[-1] - 1)
+    start = jnp.broadcast_to(starts[:, None, ::node_step, ::node_step], (2, *X.shape[1:]))
     return jnp.stack(project_from(image, search, tuple(X), *start))
 
 
@@ -297,12 +299,12 @@ def _search(
     """Lines and pixels of points [3, n] by a search of the image, in batches of points."""
     places = np.empty((2, X.shape[1]))
     for k in range(0, X.shape[1], portion):
-        few = X[:, k : k + portion]
-        n = few.shape[1]
-        full = np.pad(few, ((0, 0), (0, portion - n)), mode="edge")
+        portion_of_points = X[:, k : k + portion]
+        n = portion_of_points.shape[1]
+        padded = np.pad(portion_of_points, ((0, 0), (0, portion - n)), mode="edge")
         # Of one shape, so that one program serves any number of points.
-        found = project_points(image, search, full, margin=0.0)
-        places[:, k : k + n] = np.asarray(found.line)[0, :n], np.asarray(found.pixel)[0, :n]
+        projected = project_points(image, search, padded, margin=0.0)
+        places[:, k : k + n] = np.asarray(projected.line)[0, :n], np.asarray(projected.pixel)[0, :n]
     return places
 
 
@@ -378,13 +380,13 @@ def _fill_unseen_nodes(starts: Float[np.ndarray, "2 n n"]) -> Float[np.ndarray, 
 
     Were they left out, pixels beside the outermost seen node would have no start at all.
     """
-    seen = np.isfinite(starts[0])
-    if seen.all():
+    is_seen = np.isfinite(starts[0])
+    if is_seen.all():
         return starts
-    i, j = np.indices(seen.shape)
-    A = np.stack([np.ones(seen.size), i.ravel(), j.ravel()], 1)
-    plane, *_ = np.linalg.lstsq(A[seen.ravel()], starts[:, seen].T, rcond=None)
-    return np.where(seen, starts, (A @ plane).T.reshape(starts.shape))
+    i, j = np.indices(is_seen.shape)
+    A = np.stack([np.ones(is_seen.size), i.ravel(), j.ravel()], 1)
+    plane, *_ = np.linalg.lstsq(A[is_seen.ravel()], starts[:, is_seen].T, rcond=None)
+    return np.where(is_seen, starts, (A @ plane).T.reshape(starts.shape))
 
 
 def _level(surface: GroundSurface) -> Scalar:
@@ -403,7 +405,7 @@ def _places(
     starts: Float[AnyArray, "2 n n"],
 ) -> tuple[Array, Array, Array]:
     ground = _ground(nodes, height)
-    return *project_from(image, search, tuple(ground), *_spread(starts)), ground
+    return *project_from(image, search, tuple(ground), *_interpolate_nodes(starts)), ground
 
 
 def block_heights(surface: GroundSurface, nodes: MapNodes) -> Float[np.ndarray, "rows columns"]:
@@ -423,19 +425,19 @@ def _heights(surface: GroundSurface, nodes: MapNodes) -> BlockHeights:
 def _heights_of(surface: GroundSurface, nodes: MapNodes) -> Float[Array, "rows columns"]:
     if isinstance(surface, Terrain):
         x, y, _ = surface.grid(tuple(nodes.X))
-        return jnp.asarray(bilinear(surface.heights, *_spread(jnp.stack([x, y]))))
+        return jnp.asarray(bilinear(surface.heights, *_interpolate_nodes(jnp.stack([x, y]))))
     return jnp.broadcast_to(_level(surface), (BLOCK_SIZE, BLOCK_SIZE)) * 1.0
 
 
 def _ground(nodes: MapNodes, height: Float[AnyArray, "rows columns"]) -> Float[Array, "3 r c"]:
     """The points of all pixels, [3, BLOCK_SIZE, BLOCK_SIZE]."""
-    return _spread(nodes.X) + height * _spread(nodes.up)
+    return _interpolate_nodes(nodes.X) + height * _interpolate_nodes(nodes.up)
 
 
 _raise = compile_once(_ground, ())
 
 
-def _spread(nodes: Float[AnyArray, "k n n"]) -> Float[Array, "k rows columns"]:
+def _interpolate_nodes(nodes: Float[AnyArray, "k n n"]) -> Float[Array, "k rows columns"]:
     """From nodes to all pixels, linear in between: [k, n, n] to [k, BLOCK_SIZE, BLOCK_SIZE]."""
     weights = hat_functions(BLOCK_SIZE, BLOCK_SIZE // (nodes.shape[-1] - 1))
     return jnp.einsum("ri,kij,cj->krc", weights, nodes, weights)

@@ -45,7 +45,7 @@ def resample_pixels(
 ) -> Float[Array, "*shape bands"]:
     """The values of all bands at raster positions, in the precision of `working_type`."""
     rows, columns, _ = pixels.shape
-    inside = (row >= -0.5) & (row <= rows - 0.5) & (column >= -0.5) & (column <= columns - 0.5)
+    is_inside = (row >= -0.5) & (row <= rows - 0.5) & (column >= -0.5) & (column <= columns - 0.5)
     match kind:
         case "nearest":
             # Half to even: on the border of two pixels either serves.
@@ -60,7 +60,7 @@ def resample_pixels(
             value = _convolve(pixels, row, column, _lanczos_weights, 2)
         case _:
             raise ValueError(f"Unknown resampling {kind!r}; known: {RESAMPLINGS}")
-    return jnp.where(inside[..., None], value, jnp.nan)
+    return jnp.where(is_inside[..., None], value, jnp.nan)
 
 
 def working_type(dtype: np.dtype | str) -> np.dtype:
@@ -74,23 +74,23 @@ def _convolve(
     row: Float[AnyArray, "*shape"],
     column: Float[AnyArray, "*shape"],
     weights: Callable[[Scalar], tuple[Scalar, ...]],
-    before: int,
+    pixels_before: int,
 ) -> Array:
-    """Products of one-dimensional weights of the pixels starting `before` the position."""
+    """Products of one-dimensional weights of the pixels starting `pixels_before` the position."""
     rows, columns, bands = pixels.shape
     working = working_type(pixels.dtype)
     i, j = jnp.floor(row), jnp.floor(column)
-    of = lambda place: [jnp.asarray(w)[..., None] for w in weights(place.astype(working))]
-    down, right = of(jnp.asarray(row - i)), of(jnp.asarray(column - j))
+    weights_of = lambda place: [jnp.asarray(w)[..., None] for w in weights(place.astype(working))]
+    weights_down, right = weights_of(jnp.asarray(row - i)), weights_of(jnp.asarray(column - j))
     # The index of a position that is NaN must be valid; its weights keep the value NaN.
-    i, j = (jnp.nan_to_num(v).astype(jnp.int32) - before for v in (i, j))
+    i, j = (jnp.nan_to_num(v).astype(jnp.int32) - pixels_before for v in (i, j))
     flat = pixels.reshape(-1, bands)
-    lines = [jnp.clip(i + k, 0, rows - 1) * columns for k in range(len(down))]
+    lines = [jnp.clip(i + k, 0, rows - 1) * columns for k in range(len(weights_down))]
     places = [jnp.clip(j + k, 0, columns - 1) for k in range(len(right))]
-    across = lambda line: sum(
+    sum_of_line = lambda line: sum(
         w * flat[line + place].astype(working) for w, place in zip(right, places)
     )
-    return jnp.asarray(sum(w * across(line) for w, line in zip(down, lines)))
+    return jnp.asarray(sum(w * sum_of_line(line) for w, line in zip(weights_down, lines)))
 
 
 def _cubic_weights(x: Scalar) -> tuple[Scalar, ...]:
@@ -99,9 +99,9 @@ def _cubic_weights(x: Scalar) -> tuple[Scalar, ...]:
     With the distance d, (a + 2)·d³ − (a + 3)·d² + 1 up to 1 and a·d³ − 5a·d² + 8a·d − 4a up to 2,
     a = −½.
     """
-    near = lambda d: 1 + d * d * (1.5 * d - 2.5)
-    far = lambda d: 2 + d * (-4 + d * (2.5 - 0.5 * d))
-    return far(1 + x), near(x), near(1 - x), far(2 - x)
+    inner = lambda d: 1 + d * d * (1.5 * d - 2.5)
+    outer = lambda d: 2 + d * (-4 + d * (2.5 - 0.5 * d))
+    return outer(1 + x), inner(x), inner(1 - x), outer(2 - x)
 
 
 def _lanczos_weights(x: Scalar) -> tuple[Scalar, ...]:

@@ -54,36 +54,39 @@ def signal(
             raise InputError(
                 f"signal {kind!r}: {key} is {get(key):g}; a positive number of seconds"
             )
-    passed = np.asarray(t) - start
+    elapsed = np.asarray(t) - start
     match kind:
         case "linear":
-            return get("value") + get("rate") * passed
+            return get("value") + get("rate") * elapsed
         case "sine":
-            turn = 2 * np.pi * passed / get("period", 1.0) + get("phase")
+            turn = 2 * np.pi * elapsed / get("period", 1.0) + get("phase")
             return get("value") + get("amplitude") * np.sin(turn)
         case "walk":
-            return get("value") + _walk(passed, get("sigma"), get("step", 1.0), rng)
+            return get("value") + _walk(elapsed, get("sigma"), get("step", 1.0), rng)
         case "table":
             return CubicSpline(description["times"], description["values"], extrapolate=False)(t)
     return np.full(len(t), get("value"))
 
 
-def _walk(passed: Times, sigma: float, step: float, rng: np.random.Generator) -> Times:
+def _walk(elapsed: Times, sigma: float, step: float, rng: np.random.Generator) -> Times:
     """A random walk that is 0 at the start, the spline through one node in every step."""
     # Forward and backward from the start by steps of their own: one seed gives one walk for any
     # requested times. The end of a spline acts by a factor of 2 − √3 less at every node, so that 20
     # nodes beyond the requested times leave nothing of it.
-    after, before = (20 + np.ceil(max(end, 0.0) / step) for end in (passed[-1], -passed[0]))
+    steps_after, steps_before = (
+        20 + np.ceil(max(end, 0.0) / step) for end in (elapsed[-1], -elapsed[0])
+    )
     # 1 kHz for a quarter of an hour; more would fill the memory
-    if not after + before <= 1e6:
+    if not steps_after + steps_before <= 1e6:
         raise InputError(
-            f"signal 'walk': step is {step:g} s, {after + before:.3g} in the time of the image; "
+            f"signal 'walk': step is {step:g} s, {steps_after + steps_before:.3g} in the time of "
+            "the image; "
             "give a longer one"
         )
-    after, before = int(after), int(before)
+    steps_after, steps_before = int(steps_after), int(steps_before)
     forward, backward = (
-        np.cumsum(sigma * np.sqrt(step) * one.normal(size=n))
-        for one, n in zip(rng.spawn(2), (after, before))
+        np.cumsum(sigma * np.sqrt(step) * generator.normal(size=n))
+        for generator, n in zip(rng.spawn(2), (steps_after, steps_before))
     )
     values = np.concatenate([backward[::-1], [0.0], forward])
-    return CubicSpline(step * np.arange(-before, after + 1), values)(passed)
+    return CubicSpline(step * np.arange(-steps_before, steps_after + 1), values)(elapsed)

@@ -114,7 +114,7 @@ class AccuracyTable(TableMethods):
             for cell in self.erring
         ]
         names = ["trajectory", "sigma", "interpolation", "rms", "ce90"]
-        names += [f"{way}_{value}" for way in WAYS[1:] for value in names[3:5]]
+        names += [f"{method}_{value}" for method in WAYS[1:] for value in names[3:5]]
         return {name: np.array(column) for name, column in zip(names, zip(*rows))}
 
     def to_dict(self) -> dict[str, Any]:
@@ -123,11 +123,14 @@ class AccuracyTable(TableMethods):
 
     def __str__(self) -> str:
         """Trajectories across, accuracies down."""
-        what = {"bias": "one error per image", "white": "an error in every record of the table"}
+        kind_in_words = {
+            "bias": "one error per image",
+            "white": "an error in every record of the table",
+        }
         view = _degrees(self.field_of_view)
         text = [
             f"altitude {self.altitude / 1e3:.1f} km, field of view {view:g}°",
-            f"error of attitude about each axis: {what[self.kind]}; {self.draws} draws",
+            f"error of attitude about each axis: {kind_in_words[self.kind]}; {self.draws} draws",
         ]
         line = lambda name, values, form: f"{name:22}" + "".join(f"{v:>10{form}}" for v in values)
         for value in ("rms", "ce90"):
@@ -136,9 +139,11 @@ class AccuracyTable(TableMethods):
                 cells = [getattr(c, value) for c in self.error_free if c.interpolation == method]
                 text.append(line(f"no error, {method}", cells, ".4f"))
             for sigma in dict.fromkeys(cell.sigma for cell in self.erring):
-                for way in WAYS:
-                    cells = [getattr(c, f"{way}_{value}") for c in self.erring if c.sigma == sigma]
-                    text.append(line(f"{_degrees(sigma):g}°, {way}", cells, ".2f"))
+                for row_name in WAYS:
+                    cells = [
+                        getattr(c, f"{row_name}_{value}") for c in self.erring if c.sigma == sigma
+                    ]
+                    text.append(line(f"{_degrees(sigma):g}°, {row_name}", cells, ".2f"))
         return "\n".join(text)
 
 
@@ -180,10 +185,13 @@ def accuracy_table(
             errors = ground_errors(image, truth, surface, all_lines, all_pixels)
             length = np.linalg.norm(errors, axis=1)
             # Where a ray meets the surface, as of `GroundAccuracy`.
-            known = length[np.isfinite(length)]
+            known_lengths = length[np.isfinite(length)]
             rms, ce90 = np.nan, np.nan
-            if len(known):
-                rms, ce90 = float(np.sqrt(np.mean(known**2))), float(np.quantile(known, 0.9))
+            if len(known_lengths):
+                rms, ce90 = (
+                    float(np.sqrt(np.mean(known_lengths**2))),
+                    float(np.quantile(known_lengths, 0.9)),
+                )
             error_free.append(ErrorFree(name, method, rms, ce90))
         image = measured_image(varied)
         for sigma in sigmas:
@@ -216,8 +224,10 @@ def altitude_and_view(image: PushbroomImage, surface: GroundSurface) -> tuple[fl
     )[:, 0]
     heights = [float(surface.height(tuple(X))) for X in (P, ground)]
     edges = np.array([-0.5, image.pixels - 0.5])
-    left, right = (np.append(slope, -1.0) for slope in np.stack(_slopes(image.optics, edges), 1))
-    cosine = left @ right / (np.linalg.norm(left) * np.linalg.norm(right))
+    left_edge, right_edge = (
+        np.append(slope, -1.0) for slope in np.stack(_slopes(image.optics, edges), 1)
+    )
+    cosine = left_edge @ right_edge / (np.linalg.norm(left_edge) * np.linalg.norm(right_edge))
     return heights[0] - heights[1], float(np.arccos(cosine))
 
 

@@ -66,14 +66,14 @@ class Terrain(GroundSurface):
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
         start = o, d
-        still, o, d = stop_gradient((self, o, d))
-        top, bottom = still._slab(o, d)
-        path = still._path(o, d, top, bottom)
-        tau = _first_hit(path, still.heights, self.over_voids)
+        constant, o, d = stop_gradient((self, o, d))
+        top, bottom = constant._slab(o, d)
+        path = constant._path(o, d, top, bottom)
+        tau = _first_hit(path, constant.heights, self.over_voids)
         s = top + tau * (bottom - top)
-        slope = _rate(path, tau, still.heights) / (bottom - top)
+        slope = _rate(path, tau, constant.heights) / (bottom - top)
         # Newton's step on the exact coordinates; derivatives go around the traversal
-        s = s - _above_ground(s, None, (still, o, d)) / slope
+        s = s - _above_ground(s, None, (constant, o, d)) / slope
         return implicit_root(_above_ground, solve_dense, s, None, (self, *start))
 
     def grid(self, X: Vector) -> Triple:
@@ -170,10 +170,10 @@ def cell_at(heights: Float[AnyArray, "rows columns"], x: AnyArray, y: AnyArray) 
     """The heights at the corners of the cell that begins at column x, row y; NaN off the grid."""
     rows, columns = heights.shape
     i, j = y.astype(int), x.astype(int)
-    inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
+    is_inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
     i, j = jnp.clip(i, 0, rows - 2), jnp.clip(j, 0, columns - 2)
     corners = heights[i, j], heights[i, j + 1], heights[i + 1, j], heights[i + 1, j + 1]
-    return x, y, tuple(jnp.where(inside, z, jnp.nan) for z in corners)
+    return x, y, tuple(jnp.where(is_inside, z, jnp.nan) for z in corners)
 
 
 def height_in_cell(cell: Cell, x: Scalar, y: Scalar) -> Scalar:
@@ -200,7 +200,7 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
     speed = jnp.abs(px[1]) + jnp.abs(py[1])
     # A billionth of a cell: at a border, where rounding may leave the ray in the old cell, the
     # traversal still advances.
-    least = 1e-9 / jnp.maximum(speed, 1.0)
+    smallest_step = 1e-9 / jnp.maximum(speed, 1.0)
 
     def border(p: Parabola, tau: Scalar) -> Scalar:
         """Where the coordinate reaches the next line of the grid."""
@@ -211,30 +211,32 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
 
     def step(state: TraversalState) -> TraversalState:
         tau, hit, void, _ = state
-        out = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + least, 1.0)
-        middle = (tau + out) / 2
+        leaves = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + smallest_step, 1.0)
+        middle = (tau + leaves) / 2
         x, y = value(px, middle), value(py, middle)
         cell = cell_at(heights, jnp.floor(x), jnp.floor(y))
         f = [
             value(ph, t) - height_in_cell(cell, value(px, t), value(py, t))
-            for t in (tau, middle, out)
+            for t in (tau, middle, leaves)
         ]
         part = _first_root(*f)
         # Below the terrain where heights begin again: it was met in the void.
-        under = void & (f[0] < 0)
+        is_under = void & (f[0] < 0)
         # A corner without height makes all of the cell NaN, so that the middle decides.
         void = jnp.isnan(f[1])
-        found = (part <= 1) & ~under
-        done = found | under | (out >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)
+        is_found = (part <= 1) & ~is_under
+        is_done = (
+            is_found | is_under | (leaves >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)
+        )
         if not over_voids:
-            done = done | void
-        return out, jnp.where(found, tau + part * (out - tau), jnp.nan), void, done
+            is_done = is_done | void
+        return leaves, jnp.where(is_found, tau + part * (leaves - tau), jnp.nan), void, is_done
 
     start = jnp.maximum(_entry(px, columns), _entry(py, rows))
-    lost = jnp.isnan(speed) | ~(start < 1)
+    is_lost = jnp.isnan(speed) | ~(start < 1)
     if not over_voids:
-        lost = lost | (start > 0)
-    state = start, jnp.full_like(speed, jnp.nan), start > 0, lost
+        is_lost = is_lost | (start > 0)
+    state = start, jnp.full_like(speed, jnp.nan), start > 0, is_lost
     return jax.lax.while_loop(lambda s: ~s[3], step, state)[1]
 
 
@@ -251,8 +253,8 @@ def _entry(p: Parabola, size: int) -> Scalar:
     for _ in range(3):
         x, rate = value_and_rate(p, tau)
         tau = tau + (target - x) / jnp.where(rate == 0, jnp.nan, rate)
-    outside = (p[0] < 0) | (p[0] > size - 1)
-    return jnp.where(outside, jnp.where(tau > 0, tau, jnp.inf), 0.0)
+    is_outside = (p[0] < 0) | (p[0] > size - 1)
+    return jnp.where(is_outside, jnp.where(tau > 0, tau, jnp.inf), 0.0)
 
 
 def _first_root(f0: Scalar, fm: Scalar, f1: Scalar) -> Scalar:
@@ -263,8 +265,8 @@ def _first_root(f0: Scalar, fm: Scalar, f1: Scalar) -> Scalar:
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
     # Of the two forms of a root the one without cancellation (Press et al., 2007, section 5.6).
     q = -(b + jnp.where(b < 0, -root, root)) / 2
-    first = q / jnp.where(a == 0, jnp.nan, a)
-    second = f0 / jnp.where(q == 0, jnp.nan, q)
+    root_a = q / jnp.where(a == 0, jnp.nan, a)
+    root_b = f0 / jnp.where(q == 0, jnp.nan, q)
     within = lambda w: jnp.where((w >= 0) & (w <= 1), w, jnp.inf)
-    least = jnp.minimum(within(first), within(second))
-    return jnp.where(discriminant < 0, jnp.inf, least)
+    smallest_root = jnp.minimum(within(root_a), within(root_b))
+    return jnp.where(discriminant < 0, jnp.inf, smallest_root)

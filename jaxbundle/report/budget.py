@@ -26,8 +26,8 @@ def select_rows(budget: "Budget", max_rows: int = 400) -> tuple[Sequence[tuple[s
 
 def budget_lines(budget: "Budget") -> list[str]:
     """The budget as a section of the report."""
-    rows, others = select_rows(budget)
+    rows, number_of_others = select_rows(budget)
     lines = [*heading(TITLE), *table(HEADER, rows, "llrrr")]
-    if others:
-        lines.append(f"and {others} more rows, see budget.csv")
+    if number_of_others:
+        lines.append(f"and {number_of_others} more rows, see budget.csv")
     return [*lines, "", *paragraph(LEGEND)]

@@ -144,5 +144,5 @@ def camera_equations(model: CameraModel) -> tuple[str, ...]:
     name = model.name if is_own(model) else re.sub(r"-\d.*", "", model.name)
     if name in EQUATIONS:
         return EQUATIONS[name]
-    said = (inspect.getdoc(model.formula) or "").splitlines()
-    return tuple(line for line in said if line.strip()) or ("user-defined",)
+    docstring_lines = (inspect.getdoc(model.formula) or "").splitlines()
+    return tuple(line for line in docstring_lines if line.strip()) or ("user-defined",)

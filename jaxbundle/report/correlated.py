@@ -66,16 +66,16 @@ COMPONENT_HEADER = ("component", "size", "σ", "unit", "score")
 SIGMA_HEADER = ("unknown", "σ classical", "σ correlated", "ratio")
 
 
-def stated_sigma(found: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, " rows"]:
+def stated_sigma(columns: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, " rows"]:
     """The σ of a column of a table of images or points: the larger of the classical one and, where
     it is known, that under correlated errors."""
-    return np.fmax(found[f"s{name}"], found.get(f"s{name}_correlated", found[f"s{name}"]))
+    return np.fmax(columns[f"s{name}"], columns.get(f"s{name}_correlated", columns[f"s{name}"]))
 
 
 def stated_sigma_of(parameter: Mapping[str, Any]) -> float | None:
     """The same of a camera parameter; None where it is held."""
-    known = (parameter["sigma"], parameter.get("sigma_correlated"))
-    return max((sigma for sigma in known if sigma is not None), default=None)
+    known_sigma = (parameter["sigma"], parameter.get("sigma_correlated"))
+    return max((sigma for sigma in known_sigma if sigma is not None), default=None)
 
 
 def has_shared_errors(adjustment: "Adjustment") -> bool:
@@ -126,33 +126,33 @@ def has_field(adjustment: "Adjustment") -> bool:
 
 def remarks(adjustment: "Adjustment") -> list[str]:
     """What the components that were found say, in sentences, the most significant first."""
-    unit, said = adjustment.image_unit, []
+    unit, sentences = adjustment.image_unit, []
     sizes = not_none(adjustment.error_model).sizes[1:]
-    for size in sorted(sizes, key=lambda one: -one.score):
-        name, of, camera = size.name.partition(" of ")
+    for size in sorted(sizes, key=lambda size_found: -size_found.score):
+        name, in_camera, camera = size.name.partition(" of ")
         if size.size > 0 and name in REMARKS:
             amount = f"{significant(size.size, 2)} {unit if size.unit == IMAGE else 'a priori σ'}"
             words = REMARKS[name].format(amount)
             if name == FIELD:
                 poor = is_hardly_determined(adjustment, camera)
                 words += ADVICE_ON_FIELD[advise_parameters(poor, True)]
-            said.append((f"camera {clean(camera)}: " if of else "") + words)
-    return said
+            sentences.append((f"camera {clean(camera)}: " if in_camera else "") + words)
+    return sentences
 
 
 def sigma_rows(adjustment: "Adjustment") -> list[tuple[str, str, str, str]]:
     """Classical and correlated σ of the parameters of all cameras, and medians of the images and
     points, with their ratios."""
     rows = []
-    several = len(adjustment.cameras) > 1
+    has_several = len(adjustment.cameras) > 1
     for camera, entry in adjustment.cameras.items():
-        for name, found in entry["parameters"].items():
-            if "sigma_correlated" in found:
+        for name, parameter in entry["parameters"].items():
+            if "sigma_correlated" in parameter:
                 rows.append(
                     _row(
-                        f"{clean(camera)} {name}" if several else name,
-                        found["sigma"],
-                        found["sigma_correlated"],
+                        f"{clean(camera)} {name}" if has_several else name,
+                        parameter["sigma"],
+                        parameter["sigma_correlated"],
                     )
                 )
     for columns, names in (
@@ -195,13 +195,13 @@ def difference_rows(split: "HalvesDifference") -> list[tuple[str, ...]]:
 
 def not_looked_for(model: "ErrorModel") -> str:
     """Which components a model lacks, in a sentence; empty if none."""
-    found = " ".join(size.name for size in model.sizes)
-    if "by photograph" not in found:
+    names_found = " ".join(size.name for size in model.sizes)
+    if "by photograph" not in names_found:
         return (
             f"Errors of photographs and a {FIELD} were not looked for: they need eight "
             "photographs of a camera."
         )
-    if FIELD not in found:
+    if FIELD not in names_found:
         return f"A {FIELD} was not looked for: it needs four image points for each of its splines."
     return ""
 
@@ -213,7 +213,7 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
     if adjustment.error_model is None:
         return []
     lines = [*heading(TITLE), *table(COMPONENT_HEADER, component_rows(adjustment), "lrrlr"), ""]
-    lines += [line for said in remarks(adjustment) for line in paragraph(f"- {said}", 0, 2)]
+    lines += [line for remark in remarks(adjustment) for line in paragraph(f"- {remark}", 0, 2)]
     lines += ["", *paragraph(LEGEND)]
     if words := not_looked_for(not_none(adjustment.error_model)):
         lines += paragraph(words)
@@ -222,10 +222,10 @@ def correlated_lines(adjustment: "Adjustment") -> list[str]:
 
 
 def _replication_lines(adjustment: "Adjustment") -> list[str]:
-    found = adjustment.replication
-    if found is None:
+    replication = adjustment.replication
+    if replication is None:
         return []
-    lines = [*heading("Replication"), *paragraph(f"{found.sentence}.")]
-    for split in found.splits:
+    lines = [*heading("Replication"), *paragraph(f"{replication.sentence}.")]
+    for split in replication.splits:
         lines += ["", *table(DIFFERENCE_HEADER, difference_rows(split), "lrrrrr")]
     return [*lines, "", *paragraph(REPLICATION_LEGEND)]

@@ -81,10 +81,10 @@ def title(adjustment: "Adjustment", date: str | None) -> list[str]:
     """Name of the program, its version, the date, and the network."""
     from jaxbundle import __version__
 
-    left = f"jaxbundle {__version__}: bundle adjustment"
+    program = f"jaxbundle {__version__}: bundle adjustment"
     right = clean(date or "")
-    first = f"{left}{right:>{max(WIDTH - len(left), len(right) + 2)}}".rstrip()
-    return [first, "=" * WIDTH, *paragraph(clean(adjustment.network.name) or "network")]
+    first_line = f"{program}{right:>{max(WIDTH - len(program), len(right) + 2)}}".rstrip()
+    return [first_line, "=" * WIDTH, *paragraph(clean(adjustment.network.name) or "network")]
 
 
 def settings(adjustment: "Adjustment", verdict: "Verdict | None" = None) -> list[str]:
@@ -100,15 +100,15 @@ def first_facts(
     if adjustment.converged:
         _, words, findings = verdict or adjustment.verdict
         rows = [("Verdict", words), *((f.about, f.words) for f in findings if f.lowers)]
-        said = {about for about, _ in rows}
-        rows += [row for row in correlated.first_facts(adjustment) if row[0] not in said]
+        facts_said = {about for about, _ in rows}
+        rows += [row for row in correlated.first_facts(adjustment) if row[0] not in facts_said]
     rows += [("Attention", clean(text)) for text in adjustment.findings]
     left_out = left_out_in_words(adjustment)
-    said = [f"{left_out}: see Notes, and left_out in the JSON"] if left_out else []
-    if removed := adjustment.removed:
-        words = count(sum(len(item.rows) for item in removed), "observation")
-        said.append(f'{words} by data snooping: see there, and "removed" in the JSON')
-    return [*rows, ("Left out", "; ".join(said))] if said else rows
+    facts_said = [f"{left_out}: see Notes, and left_out in the JSON"] if left_out else []
+    if removals := adjustment.removed:
+        words = count(sum(len(item.rows) for item in removals), "observation")
+        facts_said.append(f'{words} by data snooping: see there, and "removed" in the JSON')
+    return [*rows, ("Left out", "; ".join(facts_said))] if facts_said else rows
 
 
 def left_out_in_words(adjustment: "Adjustment") -> str:
@@ -149,7 +149,7 @@ def datum(adjustment: "Adjustment") -> str:
     problem, network = adjustment.problem, adjustment.problem.network
     defect = adjustment.counts.datum
     if not defect:
-        known = [
+        counted = [
             (int(network.points.has_role("control").sum()), "control point", ""),
             (int(network.points.has_role("fixed").sum()), "fixed point", ""),
             (
@@ -160,14 +160,14 @@ def datum(adjustment: "Adjustment") -> str:
             (int((problem.table("image").free == 0).any(1).sum()), "image", " held"),
             (len(network.distances), "distance", ""),
         ]
-        parts = [count(*part) for part in known if part[0]]
+        parts = [count(*part) for part in counted if part[0]]
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
     open_ones = f"defect {defect}: the observations leave open {open_datum(adjustment)}"
     weight = np.asarray(not_none(problem.plan.datum).weight["point"])[: len(network.points)] > 0
     ids = network.points.id
     if network.datum == "minimal":
-        held = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
-        how = f"these coordinates keep their start values: {', '.join(held)}"
+        held_coordinates = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
+        how = f"these coordinates keep their start values: {', '.join(held_coordinates)}"
     else:
         how = (
             f"inner constraints on {count(int(weight.any(1).sum()), 'datum point')}, whose start "
@@ -187,10 +187,10 @@ def open_datum(adjustment: "Adjustment") -> str:
     if defect in (0, 7):
         return "position, orientation and scale" if defect else ""
     # The directions are told about these points, which a rotation about them leaves.
-    known = network.points.has_role("control", "fixed")
-    about = (network.points.position[known] - adjustment.problem.origin).sum(0)
+    is_known = network.points.has_role("control", "fixed")
+    about = (network.points.position[is_known] - adjustment.problem.origin).sum(0)
     gauge = np.asarray(not_none(adjustment.problem.plan.datum).gauge)
-    words = open_directions_in_words(gauge, about / max(known.sum(), 1))
+    words = open_directions_in_words(gauge, about / max(is_known.sum(), 1))
     return "position and orientation" if defect == 6 and "scale" not in words else words
 
 
@@ -202,8 +202,8 @@ def counts(adjustment: "Adjustment") -> list[str]:
 def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
     """Label, count, and its parts."""
     network, n = adjustment.problem.network, adjustment.counts
-    there = ~adjustment.problem.excluded
-    roles = [(role, int((network.points.has_role(role) & there).sum())) for role in ROLES]
+    is_included = ~adjustment.problem.excluded
+    roles = [(role, int((network.points.has_role(role) & is_included).sum())) for role in ROLES]
     kinds = [
         ("coordinates of control points", n.control),
         ("exterior orientation", n.exterior),
@@ -217,14 +217,14 @@ def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
         ("interior orientation", sum(free(t.name) for t in adjustment.problem.cameras)),
         ("object coordinates", free("point")),
     ]
-    used = int(adjustment.problem.used.sum())
+    number_used = int(adjustment.problem.used.sum())
     points = count_points(adjustment)
     excluded = len(network.points) - points
     rows = [
         ("Cameras", len(network.cameras), ""),
         ("Images", len(network.images), ""),
         ("Points", points, _list(roles) + (f"; {excluded} more excluded" if excluded else "")),
-        ("Image points", used, ""),
+        ("Image points", number_used, ""),
         ("Observations", n.observations, "image coordinates"),
         ("Pseudo-observations", n.pseudo_observations, _list(kinds)),
         ("Datum conditions", n.datum, ""),
@@ -235,17 +235,19 @@ def count_rows(adjustment: "Adjustment") -> list[tuple[str, str, str]]:
     width = WIDTH - 4 - sum(max(len(str(row[k])) for row in rows) for k in (0, 1))
     lines = []
     for name, n, detail in rows:
-        first, *more = textwrap.wrap(detail, width) or [""]
-        lines += [(name, str(n), first), *(("", "", rest) for rest in more)]
+        first_part, *other_parts = textwrap.wrap(detail, width) or [""]
+        lines += [(name, str(n), first_part), *(("", "", part) for part in other_parts)]
     return lines
 
 
 def _count_further(problem: "NetworkProblem") -> Counter[str]:
     """The residuals with weight of further kinds."""
-    found: Counter[str] = Counter()
+    number_of_kind: Counter[str] = Counter()
     for name in problem.further_sets:
-        found[problem.observations_of(name).kind.name] += int((problem.weights(name) > 0).sum())
-    return found
+        number_of_kind[problem.observations_of(name).kind.name] += int(
+            (problem.weights(name) > 0).sum()
+        )
+    return number_of_kind
 
 
 def count_points(adjustment: "Adjustment") -> int:
@@ -260,16 +262,16 @@ def _list(groups: Iterable[tuple[str, int]]) -> str:
 
 def convergence(adjustment: "Adjustment") -> list[str]:
     """One row per evaluation; a rejected step would have increased vᵀPv."""
-    vtpv, damping, accepted = evaluations(adjustment)
-    tried = len(vtpv)
+    vtpv, damping, is_accepted = evaluations(adjustment)
+    steps_tried = len(vtpv)
     rows = [
         (
             "start" if i == 0 else str(i),
             f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
             "–" if i == 0 else f"{damping[i]:.1e}" if damping[i] else "0",
-            "" if i == 0 else "accepted" if accepted[i] else "rejected",
+            "" if i == 0 else "accepted" if is_accepted[i] else "rejected",
         )
-        for i in range(tried)
+        for i in range(steps_tried)
     ]
     # A page of lines: the beginning and the end tell how it went.
     if len(rows) > 45:
@@ -292,10 +294,10 @@ def convergence(adjustment: "Adjustment") -> list[str]:
 
 def evaluations(adjustment: "Adjustment") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """vᵀPv, damping, and whether the step was accepted, of the start and every step tried."""
-    tried, history = int(adjustment.minimum.iterations), adjustment.minimum.history
+    steps_tried, history = int(adjustment.minimum.iterations), adjustment.minimum.history
     columns = (history.cost, history.damping, history.accepted)
-    cost, damping, accepted = (np.asarray(column)[:tried] for column in columns)
-    return 2 * cost, damping, accepted
+    cost, damping, is_accepted = (np.asarray(column)[:steps_tried] for column in columns)
+    return 2 * cost, damping, is_accepted
 
 
 def image_sigmas(adjustment: "Adjustment") -> np.ndarray:
@@ -335,11 +337,11 @@ def span(values: Iterable[float], digits: int = 5) -> str:
 
 def chi_squared(adjustment: "Adjustment", level: float = 0.05) -> str:
     """The global test in words."""
-    found = adjustment.global_test(level)
-    failed = found["passed"] is False and found["vtpv"] > found["high"]
+    test = adjustment.global_test(level)
+    is_failed = test["passed"] is False and test["vtpv"] > test["high"]
     shared = correlated.has_shared_errors(adjustment)
-    words = describe_test(found, unit_of_weight(adjustment), level, shared)
-    return f"{words}, see Warnings" if failed and adjustment.doubts else words
+    words = describe_test(test, unit_of_weight(adjustment), level, shared)
+    return f"{words}, see Warnings" if is_failed and adjustment.doubts else words
 
 
 def variance_factor(adjustment: "Adjustment") -> list[str]:
@@ -371,17 +373,17 @@ def variance_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
 
 def messages(adjustment: "Adjustment") -> list[str]:
     """Warnings: suspicious data; and notes, such as of what was left out."""
-    found = []
+    lines_of_messages = []
     for title, texts in (("Warnings", warnings(adjustment)), ("Notes", adjustment.notes)):
         lines = [line for text in texts for line in paragraph(f"- {clean(text)}", 0, 2)]
-        found += [*heading(title), *cut_lines(lines, 60, "…")] if lines else []
-    return found
+        lines_of_messages += [*heading(title), *cut_lines(lines, 60, "…")] if lines else []
+    return lines_of_messages
 
 
 def warnings(adjustment: "Adjustment") -> tuple[str, ...]:
     """The warnings, without the causes that `failure_facts` gives."""
-    told = () if adjustment.converged else adjustment.findings
-    return tuple(text for text in adjustment.warnings if text not in told)
+    causes_told = () if adjustment.converged else adjustment.findings
+    return tuple(text for text in adjustment.warnings if text not in causes_told)
 
 
 def why_not_solved(adjustment: "Adjustment") -> list[str]:
@@ -394,12 +396,12 @@ def failure_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
     name."""
     names, causes = adjustment.undetermined, adjustment.findings
     reason = SINGULAR if names else int(adjustment.minimum.termination)
-    tried = int(adjustment.minimum.iterations)
-    taken = int(np.asarray(adjustment.minimum.history.accepted)[1:tried].sum())
+    steps_tried = int(adjustment.minimum.iterations)
+    steps_taken = int(np.asarray(adjustment.minimum.history.accepted)[1:steps_tried].sum())
     rows = [
         ("Why", adjustment.termination),
         *(("", clean(cause)) for cause in causes),
-        ("Iterations", f"{adjustment.iterations}, of which {taken} were steps taken"),
+        ("Iterations", f"{adjustment.iterations}, of which {steps_taken} were steps taken"),
     ]
     if names:
         rows.append(("Not determined", list_some(names, 40, clean)))
@@ -407,7 +409,7 @@ def failure_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
         rows.append(("Hardly determined", list_some(adjustment.weakness.unknowns, 40, clean)))
     # A cause says what to do itself; the general advice may contradict it.
     advice = [] if causes and not names else [ADVICE.get(reason, ADVICE[STUCK])]
-    if reason == LIMIT and taken < tried / 2:
+    if reason == LIMIT and steps_taken < steps_tried / 2:
         advice.append("Most steps were rejected: hold parameters that the images hardly determine.")
     advice += [text for kind, text in ADVICE_FOR.items() if any(f" of {kind} " in n for n in names)]
     rows += [("What to do" if i == 0 else "", text) for i, text in enumerate(advice)]

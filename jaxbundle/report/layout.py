@@ -90,7 +90,7 @@ def fixed(value: float | None, places: int) -> str:
     return f"{round(float(value), places) + 0.0:.{places}f}"
 
 
-def column_decimals(sigma: Numbers, digits: int = 3, most: int = 9) -> int:
+def column_decimals(sigma: Numbers, digits: int = 3, max_decimals: int = 9) -> int:
     """One number of decimal places for a whole column: `digits` digits of nearly every σ in it.
 
     The smallest tenth of the σ may show fewer, so that one odd value does not widen all rows.
@@ -99,7 +99,7 @@ def column_decimals(sigma: Numbers, digits: int = 3, most: int = 9) -> int:
     sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
     if not len(sigma):  # a column of held values
         return 4
-    return int(np.clip(decimals_of(np.quantile(sigma, 0.1), digits), 0, most))
+    return int(np.clip(decimals_of(np.quantile(sigma, 0.1), digits), 0, max_decimals))
 
 
 def coordinate_decimals(sigma: Numbers) -> int:
@@ -188,10 +188,10 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> l
     return [line(header), *(line(row) for row in rows)]
 
 
-def cut_lines(lines: Sequence[str], most: int, note: str) -> list[str]:
-    """A list cut after `most` lines, with a note if it was cut."""
+def cut_lines(lines: Sequence[str], max_lines: int, note: str) -> list[str]:
+    """A list cut after `max_lines` lines, with a note if it was cut."""
     lines = list(lines)
-    return lines if len(lines) <= most else [*lines[:most], note]
+    return lines if len(lines) <= max_lines else [*lines[:max_lines], note]
 
 
 def bar(count: float, largest: float, width: int = 40) -> str:

@@ -51,7 +51,7 @@ def is_hardly_determined(adjustment: "Adjustment", camera: str = "") -> bool:
     """Whether parameters of a camera are hardly determined, or its distortion turns back inside the
     image; of any camera, if none is named."""
     of_camera = f" of camera {camera}"
-    named = (
+    are_named = (
         name.endswith(of_camera) if camera else of_camera in name
         for name in adjustment.weakness.unknowns
     )
@@ -60,4 +60,4 @@ def is_hardly_determined(adjustment: "Adjustment", camera: str = "") -> bool:
         for id, reach in adjustment.distortion_reach.items()
         if camera in ("", id)
     )
-    return any(named) or any(turning)
+    return any(are_named) or any(turning)

@@ -46,10 +46,10 @@ def residuals(adjustment: Any, limit: float, test: str, max_rows: int = 100) -> 
     **Arguments:** `adjustment`: an `Adjustment` or a calibrated rig; `max_rows`: of more residuals
     the largest are listed, two pages; the tables have all.
     """
-    found, symbol = adjustment.residuals, SYMBOLS[test]
-    size = np.abs(np.nan_to_num(found[TESTS[test]]))
+    columns, symbol = adjustment.residuals, SYMBOLS[test]
+    size = np.abs(np.nan_to_num(columns[TESTS[test]]))
     order = np.argsort(-size, kind="stable")
-    over = order[size[order] > limit]
+    rows_over = order[size[order] > limit]
     lines = heading(f"Residuals with |{symbol}| > {limit:g}")
     lines += paragraph(
         f"Test: {'Pope, τ = w/σ0, σ a posteriori' if test == 'pope' else 'Baarda, σ a priori'}; "
@@ -60,16 +60,18 @@ def residuals(adjustment: Any, limit: float, test: str, max_rows: int = 100) -> 
         "that unknown."
     )
     lines.append("")
-    if len(over):
-        lines += _rows(adjustment, over[:max_rows])
-        if len(over) > max_rows:
-            more = len(over) - max_rows
-            lines.append(f"… and {more} more: all residuals are in residuals.csv or the JSON.")
-        lines += ["", f"{len(over)} of {len(size)} observations."]
+    if len(rows_over):
+        lines += _rows(adjustment, rows_over[:max_rows])
+        if len(rows_over) > max_rows:
+            number_of_others = len(rows_over) - max_rows
+            lines.append(
+                f"… and {number_of_others} more: all residuals are in residuals.csv or the JSON."
+            )
+        lines += ["", f"{len(rows_over)} of {len(size)} observations."]
     else:
         lines.append(f"None of {count(len(size), 'observation')}. The largest:")
         lines += _rows(adjustment, order[:3])
-    return lines + _histogram(found["tau"])
+    return lines + _histogram(columns["tau"])
 
 
 def critical_value(adjustment: "Adjustment", test: str = "pope", level: float = 0.001) -> float:
@@ -80,21 +82,21 @@ def critical_value(adjustment: "Adjustment", test: str = "pope", level: float = 
 
 
 def _rows(adjustment: "Adjustment", chosen: Iterable[int]) -> list[str]:
-    found, sigma0 = adjustment.residuals, adjustment.sigma0
+    columns, sigma0 = adjustment.residuals, adjustment.sigma0
     header = ("kind", "image", "point", "axis", "unit", "v", "σ", "r", "w", "τ", "MDB", "ext.")
     rows = []
     for i in chosen:
-        sigma = found["sigma"][i]
+        sigma = columns["sigma"][i]
         rows.append(
             (
-                *(found[name][i] for name in ("kind", "image", "point", "axis", "unit")),
-                to_place_of(found["v"][i], sigma0 * sigma),
+                *(columns[name][i] for name in ("kind", "image", "point", "axis", "unit")),
+                to_place_of(columns["v"][i], sigma0 * sigma),
                 significant(sigma, 3),
-                fixed(found["r"][i], 3),
-                significant(found["w"][i], 3),
-                fixed(found["tau"][i], 2),
-                to_place_of(found["mdb"][i], sigma),
-                significant(found["external"][i], 3),
+                fixed(columns["r"][i], 3),
+                significant(columns["w"][i], 3),
+                fixed(columns["tau"][i], 2),
+                to_place_of(columns["mdb"][i], sigma),
+                significant(columns["external"][i], 3),
             )
         )
     return table(header, rows, "lllll" + "r" * 7)
@@ -108,10 +110,10 @@ def _histogram(tau: Float[np.ndarray, " n"]) -> list[str]:
     edges, counted, expected = count_by_class(tau)
     largest = max(counted.max(), expected.max())
     rows = []
-    for i, found in enumerate(counted):
+    for i, number_found in enumerate(counted):
         a, b = edges[i], edges[i + 1]
         name = f"< {b:g}" if i == 0 else f"> {a:g}" if np.isinf(b) else f"{a:g} to {b:g}"
-        rows.append((name, str(found), f"{expected[i]:.1f}", bar(found, largest, 50)))
+        rows.append((name, str(number_found), f"{expected[i]:.1f}", bar(number_found, largest, 50)))
     return [
         *heading("Normalised residuals τ"),
         *table(("class", "number", "normal", ""), rows, "rrrl"),
@@ -138,8 +140,8 @@ def count_by_class(
 def redundancy(adjustment: Any, max_rows: int = 8) -> list[str]:
     """Redundancy numbers: their sum, their range, and the `max_rows` observations that are least
     controlled: enough to see which kind or point they belong to."""
-    found = adjustment.residuals
-    r = found["r"]
+    columns = adjustment.residuals
+    r = columns["r"]
     order = np.argsort(r, kind="stable")[:max_rows]
     weak, loose = count_weak(r)
     rows = [
@@ -222,22 +224,25 @@ def removals(adjustment: Any) -> list[str]:
         names = ", ".join(clean(name) for name in adjustment.eliminated)
         lines += heading("Eliminated parameters")
         defaults = {c.id: dict(get_model(c.model).defaults) for c in adjustment.network.cameras}
-        other = any(defaults.get(n.id, {}).get(n.parameter) for n in adjustment.eliminated)
+        has_other_default = any(
+            defaults.get(n.id, {}).get(n.parameter) for n in adjustment.eliminated
+        )
         lines += paragraph(
-            f"Held at {'their defaults' if other else '0'} because they were not significant, "
+            f"Held at {'their defaults' if has_other_default else '0'} because they were not "
+            "significant, "
             f"in this order: {names}."
         )
     return lines
 
 
-def downweighted(adjustment: "Adjustment", most: int) -> list[str]:
+def downweighted(adjustment: "Adjustment", max_rows: int) -> list[str]:
     """The scale of a robust estimate, and the image points it suspects."""
     if adjustment.robust is None:
         return []
     suspects = adjustment.suspects
     rows = [
         (str(i), item.kind, item.name, significant(item.test, 3), significant(item.weight, 2))
-        for i, item in enumerate(suspects[:most], 1)
+        for i, item in enumerate(suspects[:max_rows], 1)
     ]
     weighted = len(not_none(adjustment.weights))
     lines = heading(f"Robust estimation ({adjustment.robust})")
@@ -250,30 +255,30 @@ def downweighted(adjustment: "Adjustment", most: int) -> list[str]:
     if rows:
         header = ("", "kind", "observation", "test", "weight")
         lines += ["", *table(header, rows, "rllrr")]
-    if len(suspects) > most:
-        lines.append(f"… and {len(suspects) - most} more: all are in result.json.")
+    if len(suspects) > max_rows:
+        lines.append(f"… and {len(suspects) - max_rows} more: all are in result.json.")
     return lines
 
 
 # --- comparisons ----------------------------------------------------------------------------
 
 
-def check_points(adjustment: "Adjustment", most: int) -> list[str]:
+def check_points(adjustment: "Adjustment", max_rows: int) -> list[str]:
     """Check points: differences, adjusted minus given, with their σ; RMS."""
-    found = adjustment.table("checks")
-    if not found:
+    columns_of_checks = adjustment.table("checks")
+    if not columns_of_checks:
         return []
     unit = clean(adjustment.network.object_unit)
-    total = len(found["id"])
-    places = column_decimals(np.concatenate([found[f"s{axis}"] for axis in "XYZ"]))
+    total = len(columns_of_checks["id"])
+    places = column_decimals(np.concatenate([columns_of_checks[f"s{axis}"] for axis in "XYZ"]))
     rows: list[tuple[str, ...]] = [
         (
-            found["id"][i],
-            *(fixed(found[f"d{axis}"][i], places) for axis in "XYZ"),
-            *(fixed(found[f"s{axis}"][i], places) for axis in "XYZ"),
-            str(found["rays"][i]),
+            columns_of_checks["id"][i],
+            *(fixed(columns_of_checks[f"d{axis}"][i], places) for axis in "XYZ"),
+            *(fixed(columns_of_checks[f"s{axis}"][i], places) for axis in "XYZ"),
+            str(columns_of_checks["rays"][i]),
         )
-        for i in range(min(total, most))
+        for i in range(min(total, max_rows))
     ]
     rows.append(("",) * 8)
     for name, summarise in (
@@ -281,7 +286,7 @@ def check_points(adjustment: "Adjustment", most: int) -> list[str]:
         ("mean", np.mean),
         ("largest", lambda x: x[np.abs(x).argmax()]),
     ):
-        columns = (found[f"{kind}{axis}"] for kind in "ds" for axis in "XYZ")
+        columns = (columns_of_checks[f"{kind}{axis}"] for kind in "ds" for axis in "XYZ")
         columns = (
             x[np.isfinite(x)] if np.isfinite(x).any() else np.full(1, np.nan) for x in columns
         )
@@ -290,8 +295,10 @@ def check_points(adjustment: "Adjustment", most: int) -> list[str]:
         *heading(f"Check points: intersected − given, in {unit}"),
         *table(("point", "dX", "dY", "dZ", "σX", "σY", "σZ", "rays"), rows, "lrrrrrrr"),
     ]
-    if total > most:
-        lines.append(f"{total - most} more rows are in checks.csv; the summary is of all {total}.")
+    if total > max_rows:
+        lines.append(
+            f"{total - max_rows} more rows are in checks.csv; the summary is of all {total}."
+        )
     return lines
 
 
@@ -305,23 +312,23 @@ PREDICTION_LEGEND = (
 
 
 def predicted_rows(
-    found: Mapping[str, np.ndarray], names: Sequence[str], axes: str
+    columns: Mapping[str, np.ndarray], names: Sequence[str], axes: str
 ) -> list[tuple[str, ...]]:
     """Predicted control points or measurements as text, the least probable first."""
-    spread = np.concatenate([found[f"s{axis}"] for axis in axes])
-    places = column_decimals(spread)
-    order = np.argsort(np.nan_to_num(found["probability"], nan=1.0), kind="stable")
+    sigma = np.concatenate([columns[f"s{axis}"] for axis in axes])
+    places = column_decimals(sigma)
+    order = np.argsort(np.nan_to_num(columns["probability"], nan=1.0), kind="stable")
     return [
         (
-            *(str(found[name][i]) for name in names),
-            *(fixed(float(found[f"{kind}{axis}"][i]), places) for kind in "ds" for axis in axes),
-            significant(100 * float(found["probability"][i]), 2),
+            *(str(columns[name][i]) for name in names),
+            *(fixed(float(columns[f"{kind}{axis}"][i]), places) for kind in "ds" for axis in axes),
+            significant(100 * float(columns["probability"][i]), 2),
         )
         for i in order
     ]
 
 
-def predicted_control(adjustment: "Adjustment", most: int) -> list[str]:
+def predicted_control(adjustment: "Adjustment", max_rows: int) -> list[str]:
     """Control points predicted from all other observations, and their image measurements."""
     points, rays = (adjustment.table(name) for name in ("control", "control_measurements"))
     if not points:
@@ -329,14 +336,14 @@ def predicted_control(adjustment: "Adjustment", most: int) -> list[str]:
     unit = clean(adjustment.network.object_unit)
     rows = predicted_rows(points, ("id",), "XYZ")
     lines = [*heading(f"Control predicted from all other observations, in {unit}")]
-    lines += table(CONTROL_HEADER, rows[:most], "lrrrrrrr")
+    lines += table(CONTROL_HEADER, rows[:max_rows], "lrrrrrrr")
     if rays:
         listed = predicted_rows(rays, ("image", "point"), "xy")
-        shown = min(most, MEASUREMENTS_SHOWN)
+        number_shown = min(max_rows, MEASUREMENTS_SHOWN)
         lines += ["", f"Image measurements of control, in {adjustment.image_unit}"]
-        lines += table(MEASUREMENT_HEADER, listed[:shown], "llrrrrr")
-        if len(listed) > shown:
-            lines.append(f"{len(listed) - shown} more, less improbable, are in the JSON.")
+        lines += table(MEASUREMENT_HEADER, listed[:number_shown], "llrrrrr")
+        if len(listed) > number_shown:
+            lines.append(f"{len(listed) - number_shown} more, less improbable, are in the JSON.")
     return [*lines, "", *paragraph(PREDICTION_LEGEND)]
 
 
@@ -346,30 +353,30 @@ ROWS_OF_PAGE = 200
 MEASUREMENTS_SHOWN = 40
 
 
-def distances(adjustment: "Adjustment", most: int) -> list[str]:
+def distances(adjustment: "Adjustment", max_rows: int) -> list[str]:
     """Measured distances against those of the adjusted points."""
-    found = adjustment.residuals
-    rows_of = np.flatnonzero(found["kind"] == "distance")
+    columns = adjustment.residuals
+    rows_of = np.flatnonzero(columns["kind"] == "distance")
     if not len(rows_of):
         return []
     row_of = {id: i for i, id in enumerate(adjustment.points["id"])}
-    places = column_decimals(found["sigma"][rows_of])
+    places = column_decimals(columns["sigma"][rows_of])
     rows = []
-    for i in rows_of[:most]:
+    for i in rows_of[:max_rows]:
         # A distance has its points in the columns of image and point.
-        a, b = (adjustment.point_values[row_of[found[end][i]]] for end in ("image", "point"))
+        a, b = (adjustment.point_values[row_of[columns[end][i]]] for end in ("image", "point"))
         adjusted = float(np.linalg.norm(a - b))
-        v, r = found["v"][i], found["r"][i]
+        v, r = columns["v"][i], columns["r"][i]
         # σ of the adjusted distance: Q_l̂ = Q_l − Q_v, and r = (Q_v·P)ᵢᵢ
-        sigma = adjustment.sigma0 * found["sigma"][i] * math.sqrt(max(1 - r, 0))
-        values = (adjusted - v, found["sigma"][i], adjusted, sigma, v)
+        sigma = adjustment.sigma0 * columns["sigma"][i] * math.sqrt(max(1 - r, 0))
+        values = (adjusted - v, columns["sigma"][i], adjusted, sigma, v)
         rows.append(
             (
-                found["image"][i],
-                found["point"][i],
+                columns["image"][i],
+                columns["point"][i],
                 *(fixed(float(x), places) for x in values),
                 fixed(float(r), 3),
-                fixed(float(found["tau"][i]), 2),
+                fixed(float(columns["tau"][i]), 2),
             )
         )
     header = ("from", "to", "measured", "σ a priori", "adjusted", "σ", "v", "r", "τ")
@@ -377,6 +384,6 @@ def distances(adjustment: "Adjustment", most: int) -> list[str]:
         *heading(f"Distances in {clean(adjustment.network.object_unit)}"),
         *table(header, rows, "llrrrrrrr"),
     ]
-    if len(rows_of) > most:
-        lines.append(f"… and {len(rows_of) - most} more: all are in residuals.csv.")
+    if len(rows_of) > max_rows:
+        lines.append(f"… and {len(rows_of) - max_rows} more: all are in residuals.csv.")
     return lines

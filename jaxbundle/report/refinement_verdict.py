@@ -26,41 +26,41 @@ from jaxbundle.report.verdict import (
 def conclude_refinement(result: Refinement) -> Verdict:
     """The verdict on a `Refinement`, from its χ² test, redundancy numbers, blunders and check
     points."""
-    used = [row for row in result.image_points() if not row["removed"]]
-    w, r = (np.concatenate([row[name] for row in used]) for name in ("w", "r"))
-    found = result.global_test()
+    used_points = [row for row in result.image_points() if not row["removed"]]
+    w, r = (np.concatenate([row[name] for row in used_points]) for name in ("w", "r"))
+    test = result.global_test()
     fit = judge_fit(
-        found,
-        describe_test(found, UNIT_OF_WEIGHT),
+        test,
+        describe_test(test, UNIT_OF_WEIGHT),
         result.sigma0,
         bool(np.isfinite(result.prior_sigma).any()),
         result.redundancy,
     )
-    findings = [fit, describe_reliability(r, "coordinate"), _blunders(result, found, w)]
+    findings = [fit, describe_reliability(r, "coordinate"), _blunders(result, test, w)]
     if result.check is not None:
         findings.append(_check_points(result.check))
     return Verdict(*in_words(findings, len(result.warnings)), tuple(findings))
 
 
-def _blunders(result: Refinement, found: dict, w: np.ndarray) -> Finding:
+def _blunders(result: Refinement, test: dict, w: np.ndarray) -> Finding:
     """By Baarda's w with σ that were stated, else Pope's τ."""
-    stated = is_tested(result.redundancy, found["sigma_origin"])
+    is_stated = is_tested(result.redundancy, test["sigma_origin"])
     return judge_blunders(
-        np.abs(w) if stated else np.abs(w) / result.sigma0,
+        np.abs(w) if is_stated else np.abs(w) / result.sigma0,
         lambda level: (
             normal_quantile(1 - level / 2)
-            if stated
+            if is_stated
             else tau_quantile(1 - level / 2, result.redundancy)
         ),
-        "|w|" if stated else "|τ|",
+        "|w|" if is_stated else "|τ|",
         len(result.removed),
         len(w) / 2 + len(result.removed),
     )
 
 
 def _check_points(check: RefinementCheckPoints) -> Finding:
-    known = (check.sigma > 0) & np.isfinite(check.difference)
-    ratio = np.abs(check.difference[known]) / check.sigma[known]
+    is_known = (check.sigma > 0) & np.isfinite(check.difference)
+    ratio = np.abs(check.difference[is_known]) / check.sigma[is_known]
     rms = ", ".join(significant(value) for value in check.rms)
     limit = normal_quantile(1 - level_of_one(LEVEL, len(ratio)) / 2)
     return judge_check_points(len(check.id), f"RMS of computed − given {rms} m", ratio, limit)

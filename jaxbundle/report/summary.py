@@ -73,13 +73,13 @@ def summary(adjustment: "Adjustment") -> list[tuple[str, str]]:
             *_far_points(adjustment),
             ("Largest |τ|", _worst(adjustment)),
         ]
-    for noun, things in (
+    for noun, remarks in (
         ("removed observation", adjustment.removed),
         ("eliminated parameter", adjustment.eliminated),
         ("warning", adjustment.warnings),
     ):
-        if things:
-            rows.append(("Note", f"{count(len(things), noun)}: see report()"))
+        if remarks:
+            rows.append(("Note", f"{count(len(remarks), noun)}: see report()"))
     return rows
 
 
@@ -90,13 +90,13 @@ def _cameras(adjustment: "Adjustment") -> Iterator[tuple[str, str]]:
     for camera, entry in list(tables.items())[:max_cameras]:
         parts = [
             f"{name} {value}" + ("" if sigma == MISSING else f" ± {sigma}")
-            for name, found in entry["parameters"].items()
-            if found["free"]
-            for value, sigma in [estimate(found["value"], stated_sigma_of(found))]
+            for name, parameter in entry["parameters"].items()
+            if parameter["free"]
+            for value, sigma in [estimate(parameter["value"], stated_sigma_of(parameter))]
         ]
         if len(parts) > max_parameters:
-            more = len(parts) - max_parameters // 2
-            parts[max_parameters // 2 :] = [f"and {more} more parameters, see report()"]
+            number_of_others = len(parts) - max_parameters // 2
+            parts[max_parameters // 2 :] = [f"and {number_of_others} more parameters, see report()"]
         text = ", ".join(parts) if parts else "held"
         yield f"Camera {clean(camera)}", f"{entry['model']}: {text}"
     if len(tables) > max_cameras:
@@ -113,8 +113,8 @@ def _points(adjustment: "Adjustment") -> str:
         sigma = stated_sigma(adjustment.points, axis)
         sigma = sigma[np.isfinite(sigma) & (sigma > 0) & adjustment.located]
         if len(sigma):
-            middle, most = np.quantile(sigma, (0.5, share))
-            parts.append(f"σ{axis} {significant(middle)} ({significant(most)})")
+            middle, quantile = np.quantile(sigma, (0.5, share))
+            parts.append(f"σ{axis} {significant(middle)} ({significant(quantile)})")
     if not parts:
         return "no coordinate is estimated with a σ"
     brackets = f"in brackets the value that {100 * share:g} % do not exceed"
@@ -122,22 +122,24 @@ def _points(adjustment: "Adjustment") -> str:
 
 
 def _far_points(adjustment: "Adjustment") -> Iterator[tuple[str, str]]:
-    found = adjustment.far_points
-    if found is not None:
-        number = f"{count(len(found.id), 'point')} at any distance"
-        yield "", f"and {number}, {found.at_infinity.sum()} of them at infinity"
+    distant = adjustment.far_points
+    if distant is not None:
+        number = f"{count(len(distant.id), 'point')} at any distance"
+        yield "", f"and {number}, {distant.at_infinity.sum()} of them at infinity"
 
 
 def _worst(adjustment: "Adjustment") -> str:
-    found = adjustment.residuals
-    tau = np.abs(np.nan_to_num(found["tau"]))
+    columns = adjustment.residuals
+    tau = np.abs(np.nan_to_num(columns["tau"]))
     if not tau.max(initial=0.0) > 0:
         return "no observation is controlled"
     i = int(tau.argmax())
-    what = " ".join(
-        clean(part) for part in (found["kind"][i], found["image"][i], found["point"][i]) if part
+    observation = " ".join(
+        clean(part)
+        for part in (columns["kind"][i], columns["image"][i], columns["point"][i])
+        if part
     )
-    return f"{significant(tau[i])} ({what}, {found['axis'][i]})"
+    return f"{significant(tau[i])} ({observation}, {columns['axis'][i]})"
 
 
 def short(adjustment: "Adjustment") -> str:

@@ -59,21 +59,23 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
     lines = _equations(model)
     # Student's t at 95 %: 1.96 where the redundancy is large, 2 as in `Adjustment.insignificant`
     critical_t = 2.0
-    rows, held = [], []
-    for name, found in entry["parameters"].items():
+    rows, held_parameters = [], []
+    for name, parameter in entry["parameters"].items():
         # Held ones follow in one line.
-        if not found["free"]:
-            held.append(f"{name} {significant(found['value'], DIGITS_WITHOUT_SIGMA)}")
+        if not parameter["free"]:
+            held_parameters.append(
+                f"{name} {significant(parameter['value'], DIGITS_WITHOUT_SIGMA)}"
+            )
             continue
-        value, sigma = estimate(found["value"], stated_sigma_of(found))
-        t, total = found["t"], found["total_correlation"]
+        value, sigma = estimate(parameter["value"], stated_sigma_of(parameter))
+        t, total = parameter["t"], parameter["total_correlation"]
         mark = "–" if np.isnan(t) else "no" if t < critical_t else "yes"
         rows.append((name, value, sigma, significant(t, 3), mark, fixed(100 * total, 1)))
     if rows:
         header = ("parameter", "value", "σ", "t", "significant", "total corr. %")
         lines += ["", *table(header, rows, "lrrrrr")]
-    if held:
-        lines += ["", *facts([("Held", ", ".join(held))])]
+    if held_parameters:
+        lines += ["", *facts([("Held", ", ".join(held_parameters))])]
     if entry["tied"]:
         lines += ["", *facts([("Tied", ", ".join(" = ".join(group) for group in entry["tied"]))])]
     if rows:
@@ -89,19 +91,22 @@ def _one_camera(entry: Mapping[str, Any], model: CameraModel) -> list[str]:
 
 
 def _equations(model: CameraModel) -> list[str]:
-    first, *others = map(clean, camera_equations(model))
-    rows = [(f"Model {clean(model.name)}", first), *(("", line) for line in others)]
+    first_equation, *other_equations = map(clean, camera_equations(model))
+    rows = [
+        (f"Model {clean(model.name)}", first_equation),
+        *(("", line) for line in other_equations),
+    ]
     return facts(rows)
 
 
 def _triangle(names: Sequence[str], C: Float[np.ndarray, "n n"]) -> list[str]:
     """The lower triangle of a correlation matrix."""
     width = max(5, max(map(len, names)))
-    first = max(map(len, names))
-    lines = [" " * first + " " + " ".join(f"{name:>{width}}" for name in names)]
+    name_width = max(map(len, names))
+    lines = [" " * name_width + " " + " ".join(f"{name:>{width}}" for name in names)]
     for i, name in enumerate(names):
         cells = (fixed(100 * C[i, j], 0) for j in range(i + 1))
-        lines.append(f"{name:<{first}} " + " ".join(f"{cell:>{width}}" for cell in cells))
+        lines.append(f"{name:<{name_width}} " + " ".join(f"{cell:>{width}}" for cell in cells))
     return lines
 
 
@@ -110,12 +115,14 @@ def _many_cameras(adjustment: "Adjustment") -> list[str]:
     lines = []
     tables = adjustment.cameras
     for name, model in _models(adjustment).items():
-        chosen = {id: entry for id, entry in tables.items() if entry["model"] == name}
+        of_model = {id: entry for id, entry in tables.items() if entry["model"] == name}
         names = [
-            p for p in model.parameters if any(e["parameters"][p]["free"] for e in chosen.values())
+            p
+            for p in model.parameters
+            if any(e["parameters"][p]["free"] for e in of_model.values())
         ]
         rows = []
-        for camera, entry in chosen.items():
+        for camera, entry in of_model.items():
             cells = [
                 estimate(entry["parameters"][p]["value"], stated_sigma_of(entry["parameters"][p]))
                 for p in names
@@ -147,25 +154,28 @@ def validity(adjustment: "Adjustment", camera: str) -> str:
 # --- images ---------------------------------------------------------------------------------
 
 
-def images(adjustment: "Adjustment", most: int) -> list[str]:
+def images(adjustment: "Adjustment", max_rows: int) -> list[str]:
     """Exterior orientation, two lines an image: values, and σ under them."""
-    found = adjustment.images
+    columns = adjustment.images
     unit, angle = adjustment.image_unit, adjustment.network.angle_unit
-    spread = {name: stated_sigma(found, name) for name in EXTERIOR}
-    places = [coordinate_decimals(spread[name]) for name in EXTERIOR]
+    stated = {name: stated_sigma(columns, name) for name in EXTERIOR}
+    places = [coordinate_decimals(stated[name]) for name in EXTERIOR]
     scale, rms_unit = (1e3, "µm") if unit == "mm" else (1.0, unit)
-    rms_places = column_decimals(scale * found["rms"])
+    rms_places = column_decimals(scale * columns["rms"])
     rows = []
-    for i in range(min(len(found["id"]), most)):
-        values = [fixed(found[name][i], d) for name, d in zip(EXTERIOR, places)]
-        sigma = [_sigma(spread[name][i], d) for name, d in zip(EXTERIOR, places)]
-        rms = fixed(scale * found["rms"][i], rms_places)
-        rows += [(found["id"][i], *values, str(found["rays"][i]), rms), ("   σ", *sigma, "", "")]
+    for i in range(min(len(columns["id"]), max_rows)):
+        values = [fixed(columns[name][i], d) for name, d in zip(EXTERIOR, places)]
+        sigma = [_sigma(stated[name][i], d) for name, d in zip(EXTERIOR, places)]
+        rms = fixed(scale * columns["rms"][i], rms_places)
+        rows += [
+            (columns["id"][i], *values, str(columns["rays"][i]), rms),
+            ("   σ", *sigma, "", ""),
+        ]
     header = ("image", "X0", "Y0", "Z0", "ω", "φ", "κ", "rays", f"RMS v {rms_unit}")
     unit = clean(adjustment.network.object_unit)
     title = f"Images: exterior orientation in {unit} and {angle}"
     lines = [*heading(title), *table(header, rows, "lrrrrrrrr")]
-    lines += _left_out(len(found["id"]), most, "image", "images.csv")
+    lines += _left_out(len(columns["id"]), max_rows, "image", "images.csv")
     return lines
 
 
@@ -173,16 +183,18 @@ def _sigma(value: float, places: int) -> str:
     return fixed(value, places) if value > 0 else "–"
 
 
-def _left_out(total: int, most: int, noun: str, file: str) -> list[str]:
-    if total <= most:
+def _left_out(total: int, max_rows: int, noun: str, file: str) -> list[str]:
+    if total <= max_rows:
         return []
-    return [f"… and {count(total - most, f'other {noun}')}: all {total} are in {file}."]
+    return [f"… and {count(total - max_rows, f'other {noun}')}: all {total} are in {file}."]
 
 
 # --- points ---------------------------------------------------------------------------------
 
 
-def points(adjustment: "Adjustment", most: int, accuracy_unit: float | None = None) -> list[str]:
+def points(
+    adjustment: "Adjustment", max_rows: int, accuracy_unit: float | None = None
+) -> list[str]:
     """Precision of the points in summary, rays a point, then the list."""
     lines = heading("Points: precision")
     lines += _precision(adjustment, accuracy_unit)
@@ -198,7 +210,7 @@ def points(adjustment: "Adjustment", most: int, accuracy_unit: float | None = No
                 f"{names}."
             ),
         ]
-    return [*lines, *_list_of_points(adjustment, most)]
+    return [*lines, *_list_of_points(adjustment, max_rows)]
 
 
 # Of the σ of the points. A handful of hardly determined points would make their mean and RMS.
@@ -211,8 +223,8 @@ SUMMARY = (
 
 
 def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[str]:
-    found, unit = adjustment.points, clean(adjustment.network.object_unit)
-    sigma = np.stack([stated_sigma(found, axis) for axis in "XYZ"], 1)
+    columns_of_points, unit = adjustment.points, clean(adjustment.network.object_unit)
+    sigma = np.stack([stated_sigma(columns_of_points, axis) for axis in "XYZ"], 1)
     free = adjustment.problem.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
     # Points at infinity have no coordinates whose σ could be counted.
@@ -220,17 +232,17 @@ def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[st
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]
     columns = [sigma[free[:, i], i] for i in range(3)]
-    together = sigma[free]
-    places = column_decimals(together)
+    all_free = sigma[free]
+    places = column_decimals(all_free)
     rows = [
-        (name, *(fixed(float(reduce(s)), places) if len(s) else "–" for s in (*columns, together)))
+        (name, *(fixed(float(reduce(s)), places) if len(s) else "–" for s in (*columns, all_free)))
         for name, reduce in SUMMARY
     ]
-    scale = float(np.median(together)) if accuracy_unit is None else float(accuracy_unit)
+    scale = float(np.median(all_free)) if accuracy_unit is None else float(accuracy_unit)
     meaning = "the median of all" if accuracy_unit is None else "as chosen"
     rows.append(("points", *(str(len(s)) for s in columns), ""))
     header = (f"in {unit}", "σX", "σY", "σZ", "all")
-    counted = [np.histogram(s / scale, CLASSES)[0] for s in (*columns, together)]
+    counted = [np.histogram(s / scale, CLASSES)[0] for s in (*columns, all_free)]
     text = ["∞" if np.isinf(end) else f"{end:g}" for end in CLASSES]
     classes = [
         (f"{a}–{b}", *(str(column[i]) for column in counted))
@@ -238,17 +250,19 @@ def _precision(adjustment: "Adjustment", accuracy_unit: float | None) -> list[st
     ]
     # One table, so that both parts have the same columns.
     head, *body = table(header, [*rows, ("", "", "", "", ""), *classes], "lrrrr")
-    first, second = body[: len(rows)], body[len(rows) + 1 :]
+    first_rows, second_rows = body[: len(rows)], body[len(rows) + 1 :]
     note = f"Number of σ in classes of σ/s, s = {significant(scale, 3)} {unit} ({meaning})"
-    return [head, *first, "", note, *second]
+    return [head, *first_rows, "", note, *second_rows]
 
 
 def _rays(rays: Int[np.ndarray, " points"]) -> list[str]:
     """How many points have how many rays."""
-    seen = np.unique(rays)
-    groups = [(int(n), int(n)) for n in seen]
+    numbers_seen = np.unique(rays)
+    groups = [(int(n), int(n)) for n in numbers_seen]
     if len(groups) > 12:  # classes of equal ratio instead
-        edges = np.unique(np.round(np.geomspace(max(seen[0], 1), seen[-1] + 1, 11)).astype(int))
+        edges = np.unique(
+            np.round(np.geomspace(max(numbers_seen[0], 1), numbers_seen[-1] + 1, 11)).astype(int)
+        )
         groups = [(0, 0), *((int(a), int(b) - 1) for a, b in zip(edges, edges[1:]))]
     counted = [int(((rays >= a) & (rays <= b)).sum()) for a, b in groups]
     rows = [
@@ -259,58 +273,58 @@ def _rays(rays: Int[np.ndarray, " points"]) -> list[str]:
     return ["", *table(("rays", "points", ""), rows, "rrl")]
 
 
-def _list_of_points(adjustment: "Adjustment", most: int) -> list[str]:
-    found = adjustment.points
-    total = len(found["id"])
+def _list_of_points(adjustment: "Adjustment", max_rows: int) -> list[str]:
+    columns = adjustment.points
+    total = len(columns["id"])
     unit = clean(adjustment.network.object_unit)
     lines = heading(f"Points: coordinates in {unit}")
     # A table of what was given, without σ, says nothing of the result.
     if not (adjustment.problem.table("point").free > 0).any():
         return [*lines, f"All {count(total, 'point')} are held where they are given (points.csv)."]
-    shown = np.arange(min(total, most))
-    spread = {axis: stated_sigma(found, axis) for axis in "XYZ"}
-    places = [coordinate_decimals(spread[axis]) for axis in "XYZ"]
+    rows_shown = np.arange(min(total, max_rows))
+    stated = {axis: stated_sigma(columns, axis) for axis in "XYZ"}
+    places = [coordinate_decimals(stated[axis]) for axis in "XYZ"]
     rows = [
         (
-            found["id"][i],
-            ROLE_WORDS[found["role"][i]],
-            *(fixed(found[axis][i], d) for axis, d in zip("XYZ", places)),
-            *(_sigma(spread[axis][i], d) for axis, d in zip("XYZ", places)),
-            str(found["rays"][i]),
+            columns["id"][i],
+            ROLE_WORDS[columns["role"][i]],
+            *(fixed(columns[axis][i], d) for axis, d in zip("XYZ", places)),
+            *(_sigma(stated[axis][i], d) for axis, d in zip("XYZ", places)),
+            str(columns["rays"][i]),
         )
-        for i in shown
+        for i in rows_shown
     ]
     header = ("point", "role", "X", "Y", "Z", "σX", "σY", "σZ", "rays")
     return [
         *lines,
         *table(header, rows, "llrrrrrrr"),
-        *_left_out(total, most, "point", "points.csv"),
+        *_left_out(total, max_rows, "point", "points.csv"),
     ]
 
 
 # --- points at any distance -----------------------------------------------------------------
 
 
-def far_points(adjustment: "Adjustment", most: int) -> list[str]:
+def far_points(adjustment: "Adjustment", max_rows: int) -> list[str]:
     """Direction and distance of the points whose rays are nearly parallel, those at infinity
     first."""
-    found = adjustment.table("far_points")
-    if not found:
+    columns = adjustment.table("far_points")
+    if not columns:
         return []
     network = adjustment.network
-    order = np.lexsort((-found["distance"], ~found["at_infinity"]))
+    order = np.lexsort((-columns["distance"], ~columns["at_infinity"]))
     rows = [
         (
-            str(found["id"][i]),
-            *(f"{found[f'u{axis}'][i]:.6f}" for axis in "XYZ"),
-            significant(float(found["su"][i])),
+            str(columns["id"][i]),
+            *(f"{columns[f'u{axis}'][i]:.6f}" for axis in "XYZ"),
+            significant(float(columns["su"][i])),
             "at infinity"
-            if found["at_infinity"][i]
-            else significant(float(found["distance"][i]), 4),
-            significant(float(found["nearer"][i])),
-            "∞" if np.isinf(found["farther"][i]) else significant(float(found["farther"][i])),
+            if columns["at_infinity"][i]
+            else significant(float(columns["distance"][i]), 4),
+            significant(float(columns["nearer"][i])),
+            "∞" if np.isinf(columns["farther"][i]) else significant(float(columns["farther"][i])),
         )
-        for i in order[:most]
+        for i in order[:max_rows]
     ]
     place = ", ".join(significant(x, 8) for x in not_none(adjustment.far_points).origin)
     angle = network.angle_unit
@@ -321,22 +335,24 @@ def far_points(adjustment: "Adjustment", most: int) -> list[str]:
         "",
         *table(("point", "uX", "uY", "uZ", "σ", "distance", "from", "to"), rows, "lrrrrrrr"),
     ]
-    return [*lines, *_left_out(len(order), most, "point", "far_points.csv")]
+    return [*lines, *_left_out(len(order), max_rows, "point", "far_points.csv")]
 
 
 # --- further kinds of observations ----------------------------------------------------------
 
 
-def further_unknowns(adjustment: "Adjustment", most: int) -> list[str]:
+def further_unknowns(adjustment: "Adjustment", max_rows: int) -> list[str]:
     """The unknowns of further kinds of observations, a line each."""
     lines = []
     tables: dict[str, list] = {}
-    for one in adjustment.further_estimates:
-        shown = estimate(one.value, one.sigma)
-        tables.setdefault(one.table, []).append((one.row, one.name, *shown, clean(one.unit)))
+    for estimated in adjustment.further_estimates:
+        value_and_sigma = estimate(estimated.value, estimated.sigma)
+        tables.setdefault(estimated.table, []).append(
+            (estimated.row, estimated.name, *value_and_sigma, clean(estimated.unit))
+        )
     for name, rows in tables.items():
         lines += heading(clean(name[0].upper() + name[1:]))
-        lines += table(("of", "unknown", "value", "σ", "unit"), rows[:most], "llrrl")
-        if len(rows) > most:
-            lines += _left_out(len(rows), most, "unknown", "result.json")
+        lines += table(("of", "unknown", "value", "σ", "unit"), rows[:max_rows], "llrrl")
+        if len(rows) > max_rows:
+            lines += _left_out(len(rows), max_rows, "unknown", "result.json")
     return lines

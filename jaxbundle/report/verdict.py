@@ -102,33 +102,35 @@ def conclude(
     """The verdict on a solved adjustment, for a command with its own `findings` `without` some of
     those of the adjustment, and with further `warnings`."""
     # Those of the command first: they are about its own question.
-    found = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
-    return Verdict(*in_words(found, warnings + len(adjustment.warnings)), tuple(found))
+    all_findings = [*findings, *(f for f in judge(adjustment) if f.about not in without)]
+    return Verdict(
+        *in_words(all_findings, warnings + len(adjustment.warnings)), tuple(all_findings)
+    )
 
 
 def judge_fit(
-    found: dict, words: str, sigma0: float, weights_matter: bool, redundancy: float
+    test: dict, words: str, sigma0: float, weights_matter: bool, redundancy: float
 ) -> Finding:
     """The finding of a χ² test (`leastsquares.quality.global_test`). Observations better than
     their a priori σ, or than a unit of weight, only concern these σ, since those of the result are
     a posteriori; but where there are observations of other kinds, `weights_matter`."""
-    fit = _judge_fit(found, words, sigma0)
+    fit = _judge_fit(test, words, sigma0)
     unsuited = weights_matter and fit.state == NOTED and contradicts(sigma0, int(redundancy))
-    unsuited &= found["sigma_origin"] != ESTIMATED
+    unsuited &= test["sigma_origin"] != ESTIMATED
     return fit._replace(state=DOUBTFUL) if unsuited else fit
 
 
-def _judge_fit(found: dict, words: str, sigma0: float) -> Finding:
-    about, passed = "χ² test", found["passed"]
-    if found["low"] is None:
+def _judge_fit(test: dict, words: str, sigma0: float) -> Finding:
+    about, has_passed = "χ² test", test["passed"]
+    if test["low"] is None:
         return Finding(about, DOUBTFUL, words, "no redundancy, so that nothing is tested")
-    if passed is None:
-        none = "σ estimated" if found["sigma_origin"] == ESTIMATED else "no a priori σ"
-        return Finding(about, NOTED, words, none)
-    if passed:
+    if has_passed is None:
+        no_test = "σ estimated" if test["sigma_origin"] == ESTIMATED else "no a priori σ"
+        return Finding(about, NOTED, words, no_test)
+    if has_passed:
         return Finding(about, GOOD, words)
     times = f"{significant(sigma0)} times their a priori σ"
-    if found["vtpv"] < found["low"]:
+    if test["vtpv"] < test["low"]:
         return Finding(about, NOTED, words, f"residuals only {times}")
     return Finding(about, BAD, words, f"residuals {times} (χ² test)")
 
@@ -147,18 +149,18 @@ def _tested(
 
 def _correlated(adjustment: "Adjustment") -> list[Finding]:
     """σ that shared errors make larger, and the comparison of halves of the network."""
-    found = []
+    all_findings = []
     if adjustment.error_model is not None:
-        ratio, said = adjustment.sigma_ratio, remarks(adjustment)
+        ratio, sentences = adjustment.sigma_ratio, remarks(adjustment)
         words = f"σ under correlated errors are {significant(ratio, 2)} times the classical ones"
-        words += f"; {'; '.join(said[:2])}" if said else ""
+        words += f"; {'; '.join(sentences[:2])}" if sentences else ""
         state = NOTED if has_shared_errors(adjustment) else GOOD
         brief = f"σ {significant(ratio, 2)} times larger under correlated errors"
-        found.append(Finding("Correlated errors", state, words, brief))
+        all_findings.append(Finding("Correlated errors", state, words, brief))
     elif why := adjustment.why_no_error_model:
         brief = "no look at correlated errors"
-        found.append(Finding("Correlated errors", NOTED, f"not looked for: {why}", brief))
-    return [*found, *filter(None, [judge_replication(adjustment)])]
+        all_findings.append(Finding("Correlated errors", NOTED, f"not looked for: {why}", brief))
+    return [*all_findings, *filter(None, [judge_replication(adjustment)])]
 
 
 def judge_replication(adjustment: "Adjustment") -> Finding | None:
@@ -177,19 +179,19 @@ def judge_replication(adjustment: "Adjustment") -> Finding | None:
 
 def _second_minima(adjustment: "Adjustment") -> list[Finding]:
     """Solutions of which the observations choose none, and those left for a better one."""
-    found = adjustment.second_minima
-    if not found:
+    minima = adjustment.second_minima
+    if not minima:
         return []
-    unit, most = clean(adjustment.network.object_unit), 3
-    said = [clean(one.in_words(unit)) for one in found[:most]]
-    if len(found) > most:
-        said.append(f"and {len(found) - most} more: see second_minima in the JSON")
-    about, words = "Second minimum", "; ".join(said)
-    ambiguous = [one for one in found if one.ambiguous]
+    unit, max_named = clean(adjustment.network.object_unit), 3
+    sentences = [clean(second_minimum.in_words(unit)) for second_minimum in minima[:max_named]]
+    if len(minima) > max_named:
+        sentences.append(f"and {len(minima) - max_named} more: see second_minima in the JSON")
+    about, words = "Second minimum", "; ".join(sentences)
+    ambiguous = [second_minimum for second_minimum in minima if second_minimum.ambiguous]
     if ambiguous:
         brief = f"a second solution fits as well ({ambiguous[0].ambiguity})"
         return [Finding(about, DOUBTFUL, words, brief)]
-    return [Finding(about, NOTED, words, f"a better second solution taken ({found[0].ambiguity})")]
+    return [Finding(about, NOTED, words, f"a better second solution taken ({minima[0].ambiguity})")]
 
 
 def _control(adjustment: "Adjustment") -> Finding:
@@ -213,18 +215,18 @@ def _control(adjustment: "Adjustment") -> Finding:
 def name_contradicted(adjustment: "Adjustment") -> str:
     """Control points and image measurements of control that all other observations contradict, in
     words; empty without."""
-    found = adjustment.control_prediction
-    if found is None:
+    prediction = adjustment.control_prediction
+    if prediction is None:
         return ""
-    points = found.contradicted(level_of_one(LEVEL, len(found.id)))
-    rays = found.wrong_measurements(level_of_one(LEVEL, len(found.measurement)))
-    said = []
+    points = prediction.contradicted(level_of_one(LEVEL, len(prediction.id)))
+    rays = prediction.wrong_measurements(level_of_one(LEVEL, len(prediction.measurement)))
+    sentences = []
     if points:
-        said.append(f"contradicted by all others: {list_some(points, 5, clean)}")
+        sentences.append(f"contradicted by all others: {list_some(points, 5, clean)}")
     if rays:
         names = (f"{point} in {image}" for image, point in rays)
-        said.append(f"measurements contradicted by all others: {list_some(names, 5, clean)}")
-    return "".join(f"; {words}" for words in said)
+        sentences.append(f"measurements contradicted by all others: {list_some(names, 5, clean)}")
+    return "".join(f"; {words}" for words in sentences)
 
 
 def _free_network(adjustment: "Adjustment") -> Finding:
@@ -247,33 +249,37 @@ def _held_control(adjustment: "Adjustment", parts: str) -> Finding:
     any network."""
     rows, points = adjustment.residuals, adjustment.problem.network.points
     ids = [id for id, fixed in zip(points.id, points.has_role("fixed")) if fixed]
-    own = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
-    largest, limit, said = _tested(adjustment, own)
+    is_of_control = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
+    largest, limit, test_in_words = _tested(adjustment, is_of_control)
     words, brief = f"{parts} held exactly, because no σ is stated; ", "control held exactly"
     # Three points are a similarity: they fit any network.
     if len(ids) <= 3 or np.isnan(largest):
         return Finding("Control", DOUBTFUL, words + "nothing tests so few: state σ", brief)
     state = GOOD if largest <= limit else DOUBTFUL
-    return Finding("Control", state, f"{words}largest |τ| of their image points {said}", brief)
+    return Finding(
+        "Control", state, f"{words}largest |τ| of their image points {test_in_words}", brief
+    )
 
 
 def _checks(adjustment: "Adjustment") -> list[Finding]:
-    found = adjustment.check_points
-    if found is None:
+    check = adjustment.check_points
+    if check is None:
         return []
     unit = clean(adjustment.network.object_unit)
-    rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", found.rms))
+    rms = ", ".join(f"{axis} {significant(value)}" for axis, value in zip("XYZ", check.rms))
     table = adjustment.table("checks")
     d, s = (np.concatenate([table[f"{kind}{a}"] for a in "XYZ"]) for kind in "ds")
-    given = np.concatenate(not_none(adjustment.check)[0].sigma.T)
-    s = np.hypot(s, np.where(np.isfinite(given), given, 0.0))  # of the difference of both
-    known = (s > 0) & np.isfinite(d)
-    ratio = np.abs(d[known]) / s[known]
+    given_sigma = np.concatenate(not_none(adjustment.check)[0].sigma.T)
+    s = np.hypot(
+        s, np.where(np.isfinite(given_sigma), given_sigma, 0.0)
+    )  # of the difference of both
+    is_known = (s > 0) & np.isfinite(d)
+    ratio = np.abs(d[is_known]) / s[is_known]
     limit = critical_value(adjustment, level=level_of_one(LEVEL, len(ratio)))
     rms = f"RMS of intersected − given {rms} {unit}"
     return [
         judge_check_points(
-            len(found.id), rms, ratio, limit, ", of intersection and given coordinates"
+            len(check.id), rms, ratio, limit, ", of intersection and given coordinates"
         )
     ]
 
@@ -296,7 +302,7 @@ def judge_check_points(
 
 
 def describe_reliability(
-    r: Float[np.ndarray, " n"], thing: str = "observation", max_weak_share: float = 0.05
+    r: Float[np.ndarray, " n"], noun: str = "observation", max_weak_share: float = 0.05
 ) -> Finding:
     """The finding about redundancy numbers: blunders in weakly controlled observations hardly show,
     which a design can change and an adjustment cannot.
@@ -306,22 +312,22 @@ def describe_reliability(
     """
     weak, loose = count_weak(r)
     words = (
-        f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), thing)} weakly "
+        f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), noun)} weakly "
         f"controlled (r < 0.1), {loose} uncontrolled"
     )
-    brief = f"{weak} of {count(len(r), thing)} weakly controlled"
+    brief = f"{weak} of {count(len(r), noun)} weakly controlled"
     state = NOTED if weak > max_weak_share * len(r) else GOOD
     return Finding("Reliability", state, words, brief)
 
 
 def _blunders(adjustment: "Adjustment") -> Finding:
-    removed = len(adjustment.removed)
+    number_removed = len(adjustment.removed)
     return judge_blunders(
         np.abs(adjustment.residuals["tau"]),
         lambda level: critical_value(adjustment, level=level),
         "|τ|",
-        removed,
-        adjustment.counts.observations / 2 + removed,
+        number_removed,
+        adjustment.counts.observations / 2 + number_removed,
         len(adjustment.suspects),
     )
 
@@ -330,7 +336,7 @@ def judge_blunders(
     size: Float[np.ndarray, " n"],
     critical: Callable[[float], float],
     symbol: str,
-    removed: int,
+    number_removed: int,
     rays: float,
     suspects: int = 0,
 ) -> Finding:
@@ -338,29 +344,29 @@ def judge_blunders(
     residuals than chance explains.
 
     **Arguments:** `size` of the test values, NaN where uncontrolled; `critical` value at a level;
-    `removed` and suspected ones of as many `rays`.
+    `number_removed` and suspected ones of as many `rays`.
     """
     tested = size[np.isfinite(size)]
     largest = float(np.fmax.reduce(tested, initial=np.nan))
     single, limit = critical(LEVEL), critical(level_of_one(LEVEL, len(tested)))
-    over, expected = int((size > single).sum()), LEVEL * len(size)
+    number_over, expected = int((size > single).sum()), LEVEL * len(size)
     words = (
-        f"{over} of {count(len(size), 'observation')} over the critical value "
+        f"{number_over} of {count(len(size), 'observation')} over the critical value "
         f"{significant(single)} of {symbol} at {100 * LEVEL:g} % (by chance about "
         f"{significant(expected, 2)}); largest {_compare_largest(largest, limit, len(tested))}"
     )
-    if removed or suspects:
-        words += f"; {removed} removed by data snooping, {suspects} suspected"
+    if number_removed or suspects:
+        words += f"; {number_removed} removed by data snooping, {suspects} suspected"
     if largest > limit:
-        left = int((size > limit).sum())
-        return Finding("Blunders", DOUBTFUL, words, f"{count(left, 'blunder')} likely")
-    if removed > max(LARGEST_FRACTION_REMOVED * rays, explained_by_chance(rays)):
-        brief = f"{removed} of {rays:.0f} image points removed as blunders"
+        number_left = int((size > limit).sum())
+        return Finding("Blunders", DOUBTFUL, words, f"{count(number_left, 'blunder')} likely")
+    if number_removed > max(LARGEST_FRACTION_REMOVED * rays, explained_by_chance(rays)):
+        brief = f"{number_removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
     # More than chance explains, but none that stands out: σ of some are too small.
-    many = over > explained_by_chance(len(size))
-    brief = f"{count(over, 'large residual')} where chance gives {significant(expected, 2)}"
-    return Finding("Blunders", NOTED if many else GOOD, words, brief)
+    has_many = number_over > explained_by_chance(len(size))
+    brief = f"{count(number_over, 'large residual')} where chance gives {significant(expected, 2)}"
+    return Finding("Blunders", NOTED if has_many else GOOD, words, brief)
 
 
 def _compare_largest(largest: float, limit: float, number: int) -> str:
@@ -389,23 +395,23 @@ def _left_out(adjustment: "Adjustment") -> list[Finding]:
     number: dict[str, int] = {}
     for note in notes:
         if note.measured:
-            thing = note.thing.removeprefix("tie ")
-            number[thing] = number.get(thing, 0) + len(note.names)
-    kept = {
+            noun = note.thing.removeprefix("tie ")
+            number[noun] = number.get(noun, 0) + len(note.names)
+    number_kept = {
         "image": len(network.images),
         "point": len(network.points),
         "image point": len(network.observations),
     }
     share = {
-        thing: f"{n} of {count(n + kept.get(thing, 0), thing)} left out"
-        for thing, n in number.items()
+        noun: f"{n} of {count(n + number_kept.get(noun, 0), noun)} left out"
+        for noun, n in number.items()
     }
     doubtful = [
-        thing
-        for thing, n in number.items()
-        if thing == "image" or n > explained_by_chance(n + kept.get(thing, 0))
+        noun
+        for noun, n in number.items()
+        if noun == "image" or n > explained_by_chance(n + number_kept.get(noun, 0))
     ]
-    few = sum(len(note.names) for note in notes if not note.measured)
-    words = [*share.values(), *([f"{few} without enough rays"] if few else [])]
-    brief = ", ".join(share[thing] for thing in doubtful or number) or "points without enough rays"
+    number_few = sum(len(note.names) for note in notes if not note.measured)
+    words = [*share.values(), *([f"{number_few} without enough rays"] if number_few else [])]
+    brief = ", ".join(share[noun] for noun in doubtful or number) or "points without enough rays"
     return [Finding("Left out", DOUBTFUL if doubtful else NOTED, "; ".join(words), brief)]

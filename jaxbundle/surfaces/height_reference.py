@@ -88,7 +88,7 @@ def heights_of_ground_images(
     given.
 
     **Raises:** `InputError` for contradictions, and heights above a geoid without its grid."""
-    one_of("--heights", heights, HEIGHTS, none=True)
+    one_of("--heights", heights, HEIGHTS, allow_none=True)
     parts = split_system(crs)
     if heights == ELLIPSOID or (heights is None and geoid is None and parts.vertical is None):
         if parts.vertical is not None:
@@ -115,7 +115,7 @@ def heights_of_photographs(
     a grid is given.
 
     **Raises:** `InputError` for contradictions, and without a grid or a system that it needs."""
-    one_of("--heights", heights, HEIGHTS, none=True)
+    one_of("--heights", heights, HEIGHTS, allow_none=True)
     if crs is None:
         for name, value in (("--geoid", geoid), ("--heights", heights)):
             if value is not None:

@@ -48,36 +48,37 @@ Control = Number | Choice | Switch
 def draw_controls(controls: Iterable[Control], live: bool) -> str:
     """A column of controls; in a copy they only show their values."""
     dead = "" if live else " disabled"
-    return f'<div class="controls">\n{"".join(_control(one, dead) for one in controls)}</div>\n'
+    inside = "".join(_control(control, dead) for control in controls)
+    return f'<div class="controls">\n{inside}</div>\n'
 
 
-def _control(one: Control, dead: str) -> str:
-    key = f'data-key="{text(one.key)}"{dead}'
-    if isinstance(one, Number):
-        shown = f"{one.value:.{DIGITS_WITHOUT_SIGMA}g}"
-        exact = f' data-exact="{one.value!r}"' if float(shown) != one.value else ""
-        field = f'<input type="number" step="any" value="{shown}"{exact} {key}>'
+def _control(control: Control, dead: str) -> str:
+    key = f'data-key="{text(control.key)}"{dead}'
+    if isinstance(control, Number):
+        value_text = f"{control.value:.{DIGITS_WITHOUT_SIGMA}g}"
+        exact = f' data-exact="{control.value!r}"' if float(value_text) != control.value else ""
+        field = f'<input type="number" step="any" value="{value_text}"{exact} {key}>'
         slider = (
             ""
-            if one.low is None
+            if control.low is None
             else (
-                f'<input type="range" step="any" min="{one.low!r}" max="{one.high!r}" '
-                f'value="{one.value!r}" data-slides="{text(one.key)}" '
-                f'aria-label="{text(one.label)}"'
+                f'<input type="range" step="any" min="{control.low!r}" max="{control.high!r}" '
+                f'value="{control.value!r}" data-slides="{text(control.key)}" '
+                f'aria-label="{text(control.label)}"'
                 f"{dead}>"
             )
         )
-        unit = f"<span>{text(one.unit)}</span>"
-        return f"<label><span>{text(one.label)}</span>{slider}{field}{unit}</label>\n"
-    if isinstance(one, Switch):
-        ticked = " checked" if one.value else ""
+        unit = f"<span>{text(control.unit)}</span>"
+        return f"<label><span>{text(control.label)}</span>{slider}{field}{unit}</label>\n"
+    if isinstance(control, Switch):
+        ticked = " checked" if control.value else ""
         box = f'<input type="checkbox"{ticked} {key}>'
-        return f"<label><span></span>{box}{text(one.label)}</label>\n"
+        return f"<label><span></span>{box}{text(control.label)}</label>\n"
     options = "".join(
-        f"<option{' selected' if word == one.value else ''}>{text(word)}</option>"
-        for word in one.words
+        f"<option{' selected' if word == control.value else ''}>{text(word)}</option>"
+        for word in control.words
     )
-    return f"<label><span>{text(one.label)}</span><select {key}>{options}</select></label>\n"
+    return f"<label><span>{text(control.label)}</span><select {key}>{options}</select></label>\n"
 
 
 def draw_tools(live: bool, exports: Mapping[str, str] = NOTHING) -> str:

@@ -73,7 +73,7 @@ def check_test(test: str | None, significance: float, option: str = "") -> None:
 
     **Raises:** `InputError`.
     """
-    one_of(f"{option}snooping", test, TESTS, none=True)
+    one_of(f"{option}snooping", test, TESTS, allow_none=True)
     number(f"{option}significance", significance, "a number between 0 and 1", lambda a: 0 < a < 1)
 
 

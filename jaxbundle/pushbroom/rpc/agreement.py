@@ -63,19 +63,25 @@ def compare_with_rpc(
     agreements = []
     for corrections in sets:
         # Without `jit`: a program of two hundred points would be compiled for each set.
-        point = lambda pose, slopes, h, on=corrections: ground_point(
-            pose, slopes, Height(level=h, earth=WGS84), on
+        point = lambda pose, slopes, h, applied=corrections: ground_point(
+            pose, slopes, Height(level=h, earth=WGS84), applied
         )
-        here, along, across = np.split(np.stack(jax.vmap(point)(*sights)), 3, axis=1)
-        seen = jax.vmap(lambda *X: project(rpc, *geodetic(WGS84, X)))(*here)
-        off = np.stack([np.asarray(seen[0]) - line, np.asarray(seen[1]) - pixel])
-        ground = np.linalg.norm(off[0] * (along - here) + off[1] * (across - here), axis=0)
-        off = np.hypot(*off)
-        known = np.isfinite(ground)
-        rms = lambda values, known=known: float(np.sqrt(np.mean(values[known] ** 2)))
+        points, points_next_line, points_next_pixel = np.split(
+            np.stack(jax.vmap(point)(*sights)), 3, axis=1
+        )
+        projected = jax.vmap(lambda *X: project(rpc, *geodetic(WGS84, X)))(*points)
+        difference = np.stack([np.asarray(projected[0]) - line, np.asarray(projected[1]) - pixel])
+        ground = np.linalg.norm(
+            difference[0] * (points_next_line - points)
+            + difference[1] * (points_next_pixel - points),
+            axis=0,
+        )
+        difference = np.hypot(*difference)
+        is_known = np.isfinite(ground)
+        rms = lambda values, is_known=is_known: float(np.sqrt(np.mean(values[is_known] ** 2)))
         agreements.append(
-            Agreement(rms(ground), float(ground[known].max()), rms(off))
-            if known.any()
+            Agreement(rms(ground), float(ground[is_known].max()), rms(difference))
+            if is_known.any()
             else Agreement(np.nan, np.nan, np.nan)
         )
     return agreements

@@ -111,8 +111,8 @@ def fit_bias(
     if (bad := ~(sigma > 0).all(1)).any():
         raise InputError(f"{source(int(bad.argmax()))}: σ must be positive, in pixels")
     # Snooping leaves out one point after the other: the next number of a program stays the same.
-    more = round_up(n) - n
-    padded = (np.pad(column, (0, more), mode="edge") for column in control[:3])
+    padding = round_up(n) - n
+    padded = (np.pad(column, (0, padding), mode="edge") for column in control[:3])
     computed, G = (np.asarray(a)[:n] for a in images_and_slopes(rpc, earth, *padded))
     if (bad := ~np.isfinite(computed).all(1)).any():
         raise InputError(
@@ -183,8 +183,8 @@ def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     coefficients are refitted over the domain of the old ones.
     """
     if not np.any(np.r_[bias.line[1:], bias.sample[1:]]):
-        moved = (rpc.line_offset + bias.line[0], rpc.sample_offset + bias.sample[0])
-        return eqx.tree_at(lambda r: (r.line_offset, r.sample_offset), rpc, moved), None
+        shifted_offsets = (rpc.line_offset + bias.line[0], rpc.sample_offset + bias.sample[0])
+        return eqx.tree_at(lambda r: (r.line_offset, r.sample_offset), rpc, shifted_offsets), None
     # 12³ points for 39 unknowns an axis
     side = np.linspace(-1, 1, 12)
     L, P, H = (a.ravel() for a in np.meshgrid(side, side, side))
@@ -198,10 +198,10 @@ def apply_bias(rpc: Rpc, bias: RpcBias) -> tuple[Rpc, RpcCheck | None]:
     _, l_hat, s_hat, *_ = bias_terms(rpc, l, s)
     reach = 1 + DOMAIN_MARGIN
     # Corners of the box of ground coordinates may be outside the image.
-    inside = np.flatnonzero((abs(l_hat) <= reach) & (abs(s_hat) <= reach))
+    rows_inside = np.flatnonzero((abs(l_hat) <= reach) & (abs(s_hat) <= reach))
     # A multiple of 128 of the 1000 to 1728 points: most images share a compiled fit.
-    number = max(len(inside) // 128 * 128, min(len(inside), 128))
-    rows = inside[np.linspace(0, len(inside) - 1, number).astype(int)]
+    number = max(len(rows_inside) // 128 * 128, min(len(rows_inside), 128))
+    rows = rows_inside[np.linspace(0, len(rows_inside) - 1, number).astype(int)]
     table = RpcTable(*(np.asarray(column)[rows] for column in (*place, line, sample)))
     fitted = fit_rpc(table).rpc
     return fitted, check_rpc(fitted, table)
@@ -224,13 +224,13 @@ def check_domain(rpc: Rpc, control: RpcTable, source: Source) -> None:
     )
     for name, values, unit, remedy in axes:
         centre, scale = (float(getattr(rpc, f"{name}_{part}")) for part in ("offset", "scale"))
-        away = values - centre
+        difference = values - centre
         if name == "longitude":
-            away = away - 360 * np.round(away / 360)
+            difference = difference - 360 * np.round(difference / 360)
         reach = (1 + DOMAIN_MARGIN) * abs(scale)
-        outside = np.abs(away) > reach
-        if outside.any():
-            row = int(outside.argmax())
+        is_outside = np.abs(difference) > reach
+        if is_outside.any():
+            row = int(is_outside.argmax())
             raise InputError(
                 f"{source(row)}: {name} {values[row]:.9g}{unit} is outside the domain of the "
                 f"coefficients, {centre - reach:.9g} to {centre + reach:.9g}{unit}; {remedy}"

@@ -42,9 +42,9 @@ class RpcImage(eqx.Module):
 
 def heights_of(rpc: Rpc) -> tuple[float, float]:
     """The heights between which the polynomials hold, metres, to a millimetre."""
-    middle, half = float(rpc.height_offset), abs(float(rpc.height_scale))
+    middle, half_range = float(rpc.height_offset), abs(float(rpc.height_scale))
     # + 0.0: of −0 made by rounding
-    return round(middle - half, 3) + 0.0, round(middle + half, 3) + 0.0
+    return round(middle - half_range, 3) + 0.0, round(middle + half_range, 3) + 0.0
 
 
 def heights_in_words(rpc: Rpc) -> str:
@@ -59,10 +59,10 @@ def locate_rpc_lines(
     pixels: Float[AnyArray, " pixels"],
 ) -> Float[Array, "3 lines pixels"]:
     """The points of all pixels of all lines, Earth-fixed; NaN where a ray misses the surface."""
-    at = _point_at(image.rpc, surface)
+    locate_pixel = _point_at(image.rpc, surface)
     # Row by row, like `locate_lines`.
-    of_line = lambda line: jax.vmap(lambda pixel: at(line, pixel)[0])(pixels)
-    return jnp.moveaxis(jax.lax.map(of_line, lines), -1, 0)
+    points_of_line = lambda line: jax.vmap(lambda pixel: locate_pixel(line, pixel)[0])(pixels)
+    return jnp.moveaxis(jax.lax.map(points_of_line, lines), -1, 0)
 
 
 def locate_rpc_points(
@@ -81,11 +81,11 @@ def _point_at(rpc: Rpc, surface: GroundSurface) -> Callable[[Scalar, Scalar], tu
     """The point of an image position, and its `RpcStatus`."""
     inverse, earth = fit_inverse(rpc), surface.earth or WGS84
 
-    def at(line: Scalar, pixel: Scalar) -> tuple[Array, Array]:
+    def point_of_pixel(line: Scalar, pixel: Scalar) -> tuple[Array, Array]:
         longitude, latitude, height, status = locate_on(rpc, surface, line, pixel, inverse)
         return jnp.stack(earth_fixed(earth, (longitude, latitude, height))), status
 
-    return at
+    return point_of_pixel
 
 
 def project_to_rpc(
@@ -95,8 +95,8 @@ def project_to_rpc(
     longitude, latitude, height = geodetic(surface.earth or WGS84, tuple(ground))
     L, P, _ = normalise(rpc, longitude, latitude, height)
     line, pixel = project(rpc, longitude, latitude, height)
-    there = (jnp.abs(L) <= REACH) & (jnp.abs(P) <= REACH)
-    return jnp.where(there, line, jnp.nan), jnp.where(there, pixel, jnp.nan)
+    is_within = (jnp.abs(L) <= REACH) & (jnp.abs(P) <= REACH)
+    return jnp.where(is_within, line, jnp.nan), jnp.where(is_within, pixel, jnp.nan)
 
 
 def are_occluded_in_rpc(
@@ -109,11 +109,11 @@ def are_occluded_in_rpc(
 ) -> Bool[Array, "rows columns"]:
     """Whether the rays of image positions end before their points, by more than half a pixel of the
     map, metres (see `rectification`)."""
-    inverse, at = fit_inverse(rpc), _point_at(rpc, surface)
+    inverse, point_of_pixel = fit_inverse(rpc), _point_at(rpc, surface)
 
     def is_occluded(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> Array:
         _, downwards = sight(rpc, line, pixel, surface.earth or WGS84, inverse)
-        gap = difference(X, at(line, pixel)[0])
+        gap = difference(X, point_of_pixel(line, pixel)[0])
         return jnp.asarray((dot(gap, downwards) > 0) & (length(gap) > half_pixel))
 
     of_row = lambda row: jax.vmap(is_occluded)(*row)

@@ -155,29 +155,29 @@ def locate(
     `inverse` says.
     """
     H = (height - rpc.height_offset) / rpc.height_scale
-    wanted = (
+    line_and_sample = (
         (line - rpc.line_offset) / rpc.line_scale,
         (sample - rpc.sample_offset) / rpc.sample_scale,
     )
-    data = rpc, H, wanted
+    data = rpc, H, line_and_sample
     fixed = stop_gradient(data)
     misclosure = lambda L, P: _misclosure((L, P), None, fixed)
 
     def goes_on(state: tuple[int, Place, Scalar]) -> Array:
-        number, _, last = state
-        return jnp.asarray((number < max_steps) & (last > SETTLED))
+        number, _, last_step = state
+        return jnp.asarray((number < max_steps) & (last_step > SETTLED))
 
     def newton(state: tuple[int, Place, Scalar]) -> tuple[int, Place, Scalar]:
         number, place, _ = state
-        one, nil = jnp.ones_like(place[0]), jnp.zeros_like(place[0])
-        v, by_L = jax.jvp(misclosure, place, (one, nil))
-        _, by_P = jax.jvp(misclosure, place, (nil, one))
+        ones, nil = jnp.ones_like(place[0]), jnp.zeros_like(place[0])
+        v, by_L = jax.jvp(misclosure, place, (ones, nil))
+        _, by_P = jax.jvp(misclosure, place, (nil, ones))
         # Both with the Jacobian of the first.
         step = _solve(by_L, by_P, v)
-        there = place[0] - step[0], place[1] - step[1]
-        rest = _solve(by_L, by_P, misclosure(*there))
-        there = there[0] - rest[0], there[1] - rest[1]
-        return number + 1, there, jnp.maximum(jnp.abs(step[0]), jnp.abs(step[1]))
+        next_place = place[0] - step[0], place[1] - step[1]
+        correction = _solve(by_L, by_P, misclosure(*next_place))
+        next_place = next_place[0] - correction[0], next_place[1] - correction[1]
+        return number + 1, next_place, jnp.maximum(jnp.abs(step[0]), jnp.abs(step[1]))
 
     begin = jnp.zeros_like(H), jnp.zeros_like(H)
     if inverse is not None:
@@ -191,21 +191,21 @@ def locate(
     longitude = jnp.radians(rpc.longitude_offset + rpc.longitude_scale * L)
     latitude = jnp.radians(rpc.latitude_offset + rpc.latitude_scale * P)
     settled_only = lambda a: jnp.where(settled, a, jnp.nan)
-    status = jnp.where(settled, _inside(L, P, H, *wanted), int(RpcStatus.NOT_CONVERGED))
+    status = jnp.where(settled, _inside(L, P, H, *line_and_sample), int(RpcStatus.NOT_CONVERGED))
     return settled_only(longitude), settled_only(latitude), status
 
 
 def _misclosure(place: Place, _: None, data: tuple[Rpc, Scalar, Place]) -> Place:
     """Line and sample of (L, P), both in units of the scales, minus those wanted."""
-    rpc, H, wanted = data
+    rpc, H, line_and_sample = data
     line, sample = _ratios(rpc, *place, H)
-    return line - wanted[0], sample - wanted[1]
+    return line - line_and_sample[0], sample - line_and_sample[1]
 
 
 def _solve_root(times: Callable, _: None, b: Place) -> Place:
     """The solution of A·x = b, of `implicit_root`."""
-    one, nil = jnp.ones_like(b[0]), jnp.zeros_like(b[0])
-    return _solve(times((one, nil)), times((nil, one)), b)
+    ones, nil = jnp.ones_like(b[0]), jnp.zeros_like(b[0])
+    return _solve(times((ones, nil)), times((nil, ones)), b)
 
 
 def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Array:
@@ -213,8 +213,8 @@ def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Arr
     coefficients."""
     place = normalise(rpc, longitude, latitude, height)
     line, sample = _ratios(rpc, *place)
-    inside = _inside(*place, line, sample)
-    return jnp.where(jnp.isfinite(line + sample), inside, int(RpcStatus.NOT_CONVERGED))
+    is_inside = _inside(*place, line, sample)
+    return jnp.where(jnp.isfinite(line + sample), is_inside, int(RpcStatus.NOT_CONVERGED))
 
 
 def locate_on(
@@ -242,8 +242,8 @@ def locate_on(
         X = point_on_ray(o, d, surface.distance(o, d))
         h = surface.height(X)
         longitude, latitude, status = locate(rpc, line, sample, h, inverse)
-        seen = earth_fixed(earth, (longitude, latitude, h))
-        return (point_on_ray(o, difference(seen, X), 1.0), (longitude, latitude, h, status)), None
+        placed = earth_fixed(earth, (longitude, latitude, h))
+        return (point_on_ray(o, difference(placed, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
     # Also of a surface that rises above the heights of the domain the first point is met.
@@ -300,15 +300,15 @@ def locate_points(
     """Longitudes, latitudes (radians) and statuses of many positions at given heights."""
     inverse = fit_inverse(rpc)
 
-    def every(max_steps: int) -> tuple[Array, Array, Array]:
-        of = lambda l, s, h: locate(rpc, l, s, h, inverse, max_steps)
-        return jax.vmap(of)(line, sample, height)
+    def locate_all(max_steps: int) -> tuple[Array, Array, Array]:
+        locate_one = lambda l, s, h: locate(rpc, l, s, h, inverse, max_steps)
+        return jax.vmap(locate_one)(line, sample, height)
 
     # One step of nearly every image settles all: without the loop, which keeps its values in
     # memory between steps, in half the time.
-    first = every(1)
-    settled = jnp.all(first[2] != int(RpcStatus.NOT_CONVERGED))
-    return jax.lax.cond(settled, lambda: first, lambda: every(MAX_STEPS))
+    first_results = locate_all(1)
+    settled = jnp.all(first_results[2] != int(RpcStatus.NOT_CONVERGED))
+    return jax.lax.cond(settled, lambda: first_results, lambda: locate_all(MAX_STEPS))
 
 
 @without_masks

@@ -84,8 +84,8 @@ def compose_failure(
 ) -> Iterator[str]:
     """The page of an adjustment that ended before there was a result."""
     rows = [("Why", str(error)), *(("Not determined", name) for name in error.undetermined)]
-    first = explain_failure(rows, ())
-    yield from write(Page(f"no result: {kind}", [first], origin))
+    first_section = explain_failure(rows, ())
+    yield from write(Page(f"no result: {kind}", [first_section], origin))
 
 
 def describe(
@@ -97,18 +97,18 @@ def describe(
     settings = head.setting_facts(adjustment)
     warnings = (*also.warnings, *head.warnings(adjustment))
     if not adjustment.converged:
-        first = explain_failure(head.failure_facts(adjustment), warnings, also.overview)
-        return Page(title, [first, *also.sections], origin, settings, also.tables)
+        first_section = explain_failure(head.failure_facts(adjustment), warnings, also.overview)
+        return Page(title, [first_section, *also.sections], origin, settings, also.tables)
     noted = list_messages("Notes", adjustment.notes)
     findings = also.conclude(adjustment).findings
-    first = give_verdict(findings, warnings, also.overview, noted, *_result(adjustment))
+    first_section = give_verdict(findings, warnings, also.overview, noted, *_result(adjustment))
     drawings: dict[str, Any] = {
         "network-data": describe_network(adjustment),
         "frames": describe_frames(adjustment),
     }
-    shown = [first, *also.sections, *sections.collect(adjustment)]
+    sections_shown = [first_section, *also.sections, *sections.collect(adjustment)]
     tables = {**also.tables, **collect_tables(adjustment)}
-    return Page(title, shown, origin, settings, tables, drawings)
+    return Page(title, sections_shown, origin, settings, tables, drawings)
 
 
 def _result(adjustment: "Adjustment") -> list[str]:

@@ -107,11 +107,11 @@ def draw_plan(
     lines: Sequence[Curve],
     x_label: str,
     y_label: str,
-    down: bool = False,
+    y_down: bool = False,
     layout: ChartLayout = LAYOUT,
 ) -> str:
-    """Lines in a plane, both axes at one scale; `down`: y grows downwards. Lines of the same label
-    have one sample."""
+    """Lines in a plane, both axes at one scale; `y_down`: y grows downwards. Lines of the same
+    label have one sample."""
     xs, ys = (np.concatenate([getattr(line, name) for line in lines]) for name in ("x", "y"))
     ends = [_scale(v, 0, 1, 0.03) for v in (xs, ys)]
     room = layout.plot_right - layout.left, layout.plot_bottom - layout.top
@@ -119,7 +119,7 @@ def draw_plan(
     # The remaining space is shared by both sides.
     low = [(end.low + end.high - unit * size) / 2 for end, size in zip(ends, room)]
     ends_of_y = (layout.plot_bottom, layout.top)  # SVG counts y from above
-    start, end = ends_of_y[::-1] if down else ends_of_y
+    start, end = ends_of_y[::-1] if y_down else ends_of_y
     x = Scale(low[0], low[0] + unit * room[0], layout.left, layout.plot_right)
     y = Scale(low[1], low[1] + unit * room[1], start, end)
     parts = [_axes(x, y, x_label, y_label, layout)]
@@ -135,7 +135,7 @@ def draw_histogram(
     edges: Float[np.ndarray, " edges"],
     counted: Int[np.ndarray, " classes"],
     x_label: str,
-    things: str,
+    y_label: str,
     expected: Float[np.ndarray, " classes"] | None = None,
     layout: ChartLayout = LAYOUT,
 ) -> str:
@@ -150,13 +150,13 @@ def draw_histogram(
     tallest = max(counted.max(initial=1), 0 if expected is None else expected.max(initial=1))
     y = _scale(np.array([0.0, tallest]), layout.plot_bottom, layout.top)
     base = float(y(0))
-    parts = [_axes(x, y, x_label, things, layout, whole=True)]
+    parts = [_axes(x, y, x_label, y_label, layout, whole_numbers=True)]
     parts += [
         f'<rect class="bar" x="{x(a):.1f}" y="{y(n):.1f}" width="{x(b) - x(a):.1f}" '
         f'height="{base - y(n):.1f}"/>\n'
         for a, b, n in zip(ends, ends[1:], counted)
     ]
-    names = [("bar", things)]
+    names = [("bar", y_label)]
     if expected is not None:
         steps = _places(x, y, np.repeat(ends, 2)[1:-1], np.repeat(expected, 2))
         parts.append(f'<polyline class="second" points="{steps}"/>\n')
@@ -171,12 +171,12 @@ def draw_field(
     without a number is empty. `digits`: significant ones; 0: whole numbers."""
     rows, columns = values.shape
     wide, high = layout.width / columns, layout.height / rows
-    there = np.isfinite(values)
-    low, top = (values[there].min(), values[there].max()) if there.any() else (0.0, 1.0)
+    is_finite = np.isfinite(values)
+    low, top = (values[is_finite].min(), values[is_finite].max()) if is_finite.any() else (0.0, 1.0)
     shade = 0.6 * (values - low) / (top - low or 1.0)  # the numbers stay legible on the darkest
     format_cell = lambda value: f"{value:.0f}" if digits == 0 else significant(value, digits)
     parts = []
-    for i, j in np.argwhere(there):
+    for i, j in np.argwhere(is_finite):
         x, y = j * wide, i * high
         parts.append(
             f'<rect class="cell" x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{high:.1f}" '
@@ -191,13 +191,13 @@ def draw_field(
 def _scale(values: np.ndarray, start: float, end: float, margin: float = 0.0) -> Scale:
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    spread = high - low or abs(high) or 1.0
-    low, high = low - margin * spread, high + margin * spread
+    extent = high - low or abs(high) or 1.0
+    low, high = low - margin * extent, high + margin * extent
     # Less than this of the value is its rounding, for which ticks have no digits.
-    least = 1e-9 * max(abs(low), abs(high))
-    if high - low < least:
-        low, high = low - least / 2, high + least / 2
-    return Scale(low, high if high > low else low + spread, start, end)
+    smallest_extent = 1e-9 * max(abs(low), abs(high))
+    if high - low < smallest_extent:
+        low, high = low - smallest_extent / 2, high + smallest_extent / 2
+    return Scale(low, high if high > low else low + extent, start, end)
 
 
 class Ticks(NamedTuple):
@@ -209,10 +209,10 @@ class Ticks(NamedTuple):
     offset: str = ""
 
 
-def _ticks(scale: Scale, logarithmic: bool, whole: bool = False) -> Ticks:
-    """About five ticks within a scale; `whole`: whole ones where it has at least two."""
+def _ticks(scale: Scale, logarithmic: bool, whole_numbers: bool = False) -> Ticks:
+    """About five ticks within a scale; `whole_numbers`: whole ones where it has at least two."""
     if not logarithmic:
-        values = _round_values(scale.low, scale.high, whole)
+        values = _round_values(scale.low, scale.high, whole_numbers)
         offset, names = label_ticks(values)
         return Ticks(values, names, offset_in_words(offset))
     if scale.high - scale.low < 1:  # within a decade the powers of ten say nothing
@@ -225,15 +225,16 @@ def _ticks(scale: Scale, logarithmic: bool, whole: bool = False) -> Ticks:
     return Ticks(powers, [f"{10.0**power:.6g}" for power in powers])
 
 
-def _round_values(low: float, high: float, whole: bool = False) -> np.ndarray:
-    """About five round numbers between two; `whole`: whole ones where there are at least two."""
+def _round_values(low: float, high: float, whole_numbers: bool = False) -> np.ndarray:
+    """About five round numbers between two; `whole_numbers`: whole ones where there are at least "
+    "two."""
     rough = (high - low) / 5
-    if whole and np.floor(high) > np.ceil(low):
+    if whole_numbers and np.floor(high) > np.ceil(low):
         rough = max(rough, 1.0)
     power = 10.0 ** np.floor(np.log10(rough))
     step = next(s * power for s in (1, 2, 5, 10) if s * power >= rough * (1 - 1e-9))
-    first = np.ceil(low / step - 1e-9)
-    return step * np.arange(first, np.floor(high / step + 1e-9) + 1)
+    first_value = np.ceil(low / step - 1e-9)
+    return step * np.arange(first_value, np.floor(high / step + 1e-9) + 1)
 
 
 def _axes(
@@ -243,22 +244,22 @@ def _axes(
     y_label: str,
     layout: ChartLayout,
     logarithmic: str = "",
-    whole: bool = False,
+    whole_numbers: bool = False,
 ) -> str:
-    """Axes with their ticks; `whole`: y counts."""
+    """Axes with their ticks; `whole_numbers`: y counts."""
     parts = []
     left, right = layout.left, layout.plot_right
     top, bottom = layout.top, layout.plot_bottom
-    across = _ticks(x, "x" in logarithmic)
-    for tick, name in zip(x(across.places), across.names):
+    ticks_x = _ticks(x, "x" in logarithmic)
+    for tick, name in zip(x(ticks_x.places), ticks_x.names):
         parts.append(
             f'<line class="grid" x1="{tick:.1f}" x2="{tick:.1f}" y1="{top}" '
             f'y2="{bottom}"/>\n'
             f'<text class="tick" x="{tick:.1f}" y="{bottom + 16}" '
             f'text-anchor="middle">{name}</text>\n'
         )
-    up = _ticks(y, "y" in logarithmic, whole)
-    for tick, name in zip(y(up.places), up.names):
+    ticks_y = _ticks(y, "y" in logarithmic, whole_numbers)
+    for tick, name in zip(y(ticks_y.places), ticks_y.names):
         parts.append(
             f'<line class="grid" x1="{left}" x2="{right}" y1="{tick:.1f}" '
             f'y2="{tick:.1f}"/>\n'
@@ -268,16 +269,16 @@ def _axes(
     middle = (top + bottom) / 2
     parts.append(
         f'<text x="{(left + right) / 2}" y="{layout.height - 8}" text-anchor="middle">'
-        f"{text(x_label + across.offset)}</text>\n"
+        f"{text(x_label + ticks_x.offset)}</text>\n"
         f'<text x="14" y="{middle}" text-anchor="middle" '
-        f'transform="rotate(-90 14 {middle})">{text(y_label + up.offset)}</text>\n'
+        f'transform="rotate(-90 14 {middle})">{text(y_label + ticks_y.offset)}</text>\n'
     )
     return "".join(parts)
 
 
 def _places(x: Scale, y: Scale, xs: Float[np.ndarray, " n"], ys: Float[np.ndarray, " n"]) -> str:
-    there = np.isfinite(xs) & np.isfinite(ys)
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(xs[there]), y(ys[there])))
+    is_finite = np.isfinite(xs) & np.isfinite(ys)
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(xs[is_finite]), y(ys[is_finite])))
 
 
 def _svg(parts: Sequence[str], layout: ChartLayout) -> str:

@@ -62,16 +62,18 @@ def encode_values(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
     if values.dtype.kind in "OU":
         # Ids repeat in every row of an image or a point.
         codes: dict[str, int] = {}
-        found = [codes.setdefault(str(value), len(codes)) for value in values]
-        return {"names": list(codes)} | _pack(np.array(found, int))
+        row_codes = [codes.setdefault(str(value), len(codes)) for value in values]
+        return {"names": list(codes)} | _pack(np.array(row_codes, int))
     return _pack(values, exact)
 
 
 def _pack(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
     if values.dtype.kind in "iu":
-        low, high = (int(of(initial=0)) for of in (values.min, values.max))
+        low, high = (int(limit_of(initial=0)) for limit_of in (values.min, values.max))
         ranges = ((k, np.iinfo(k)) for k in INTEGERS)
-        kind = next((k for k, of in ranges if of.min <= low and high <= of.max), "<f8")
+        kind = next(
+            (k for k, limit_of in ranges if limit_of.min <= low and high <= limit_of.max), "<f8"
+        )
     else:
         kind = "<f8" if exact else "<f4"
     # The page decodes little-endian bytes, whatever this machine has.

@@ -78,15 +78,15 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
         if any(len(column.values) for column in table.columns.values())
     }
     # The verdict stands before the contents, on the first screen.
-    first, *sections = page.sections
+    first_section, *sections = page.sections
     listed = [_listing(id, table) for id, table in tables.items()]
     if listed:
         # One link leads to all tables.
         listed[0] = listed[0]._replace(link="Tables")
-    last = _origin(page)
+    last_section = _origin(page)
     yield _beginning(page, date or page.origin.computed or in_words(now()))
-    yield _section(first)
-    yield _contents([*sections, *listed, last])
+    yield _section(first_section)
+    yield _contents([*sections, *listed, last_section])
     yield from map(_section, sections)
     if listed:
         yield markup.paragraph(
@@ -94,7 +94,7 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
         )
         yield NO_SCRIPT
         yield from map(_section, listed)
-    yield _section(last)
+    yield _section(last_section)
     for id, table in tables.items():
         yield _data(f"data-{id}", encode_table(table.columns))
     for id, value in page.drawings.items():
@@ -133,11 +133,11 @@ def _origin(page: Page) -> Section:
 
 
 def _beginning(page: Page, date: str) -> str:
-    made = " · ".join(map(clean, stamp([file.name for file in page.origin.inputs], date)))
+    stamp_line = " · ".join(map(clean, stamp([file.name for file in page.origin.inputs], date)))
     # Repeated in the margin of every printed page, by browsers that know margin boxes.
     margins = (
         f'@page {{ @top-left {{ content: "{_css_text(clean(page.title))}"; font-size: 8pt; }} '
-        f'@bottom-left {{ content: "{_css_text(made)}"; font-size: 8pt; }} }}\n'
+        f'@bottom-left {{ content: "{_css_text(stamp_line)}"; font-size: 8pt; }} }}\n'
     )
     style, script = _read(STYLE) + margins + page.style, _script(page)
     policy = (
@@ -153,7 +153,7 @@ def _beginning(page: Page, date: str) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"{icon}<title>{title}</title>\n<style>{style}</style>\n</head>\n<body>\n"
-        f"<header><h1>{title}</h1>{markup.paragraph(made, 'made')}</header>\n<main>\n"
+        f"<header><h1>{title}</h1>{markup.paragraph(stamp_line, 'made')}</header>\n<main>\n"
     )
 
 

@@ -57,12 +57,15 @@ def stamp(files: Sequence[str], computed: str) -> list[str]:
     folder, and the number of others; date; version."""
     from jaxbundle import __version__
 
-    said = [f"computed {computed}", f"jaxbundle {__version__}"]
+    computed_and_version = [f"computed {computed}", f"jaxbundle {__version__}"]
     if not files:
-        return said
-    others = len(files) - 1
+        return computed_and_version
+    number_of_others = len(files) - 1
     name = "/".join(Path(files[0]).parts[-2:])
-    return [name + (f" and {count(others, 'other file')}" if others else ""), *said]
+    return [
+        name + (f" and {count(number_of_others, 'other file')}" if number_of_others else ""),
+        *computed_and_version,
+    ]
 
 
 def head_line(origin: Origin) -> str:

@@ -32,17 +32,17 @@ def compose_refinement(result: Refinement, origin: Origin = UNKNOWN) -> Iterator
 
 
 def _describe(result: Refinement, origin: Origin) -> Page:
-    found = _image_points(result)
-    used = [row for row in found if not row["removed"]]
-    w = np.concatenate([row["w"] for row in used])
+    all_points = _image_points(result)
+    used_points = [row for row in all_points if not row["removed"]]
+    w = np.concatenate([row["w"] for row in used_points])
     findings = conclude_refinement(result).findings
-    first = give_verdict(findings, result.warnings, _list_numbers(result, used))
-    sections = [first, photographs("w"), _unknowns(result), show_residuals(w, "w")]
+    first_section = give_verdict(findings, result.warnings, _list_numbers(result, used_points))
+    sections = [first_section, photographs("w"), _unknowns(result), show_residuals(w, "w")]
     tables = {
-        "images": Listing("Images", _images(result, used), "result.json"),
+        "images": Listing("Images", _images(result, used_points), "result.json"),
         "points": Listing("Points", _points(result), "points.csv"),
         "checks": Listing("Check points, computed − given", _checks(result), "result.json"),
-        "observations": Listing("Image points", _observations(used), "result.json"),
+        "observations": Listing("Image points", _observations(used_points), "result.json"),
         "heights": Listing("Terrain heights", _terrain_heights(result), "result.json"),
         "removed": Listing(
             "Removed as blunders",
@@ -53,7 +53,7 @@ def _describe(result: Refinement, origin: Origin) -> Page:
             "result.json",
         ),
     }
-    title = f"{', '.join(one.id for one in result.images)}: {KIND}"
+    title = f"{', '.join(scanner_image.id for scanner_image in result.images)}: {KIND}"
     frames = {"frames": _frames(result)}
     return Page(title, sections, origin, tables=tables, drawings=frames)
 
@@ -64,20 +64,20 @@ def _words(values: Iterable[object]) -> np.ndarray:
 
 def _image_points(result: Refinement) -> list[ImagePoint]:
     """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
-    declared, given = result.inspection.declared, result.inspection.declared.inputs
+    declared, inputs = result.inspection.declared, result.inspection.declared.inputs
     xy = lambda table: np.asarray(
-        not_none(given.frames).observations.xy if table == PHOTOGRAPH else given.observations.xy
+        not_none(inputs.frames).observations.xy if table == PHOTOGRAPH else inputs.observations.xy
     )
     # The parts of the equations are in another order than the images.
     measured = declared.image_by_image(xy(p.table)[p.rows] for p in declared.parts)
-    scanners = {one.id for one in result.images}
+    scanners = {scanner_image.id for scanner_image in result.images}
     return [
-        row | {"measured": at, "axes": SCANNER_AXES if row["image"] in scanners else ("x", "y")}
-        for row, at in zip(result.image_points(), measured)
+        row | {"measured": place, "axes": SCANNER_AXES if row["image"] in scanners else ("x", "y")}
+        for row, place in zip(result.image_points(), measured)
     ]
 
 
-def _list_numbers(result: Refinement, used: Sequence[ImagePoint]) -> str:
+def _list_numbers(result: Refinement, used_points: Sequence[ImagePoint]) -> str:
     roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     frames = 0 if result.frames is None else len(result.frames.images)
     rows = [
@@ -85,7 +85,7 @@ def _list_numbers(result: Refinement, used: Sequence[ImagePoint]) -> str:
         ("Photographs", frames),
         ("Points", ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))),
         ("Points by rays", ", ".join(f"{n} with {k}" for k, n in result.rays().items())),
-        ("Image points", len(used)),
+        ("Image points", len(used_points)),
         ("Counts", ", ".join(f"{word} {n}" for word, n in result.counts().items() if n)),
         (
             "σ0",
@@ -103,11 +103,11 @@ def _unknowns(result: Refinement) -> Section:
     numbered = [
         f"{i}: {name}" if shows_matrix else str(name) for i, name in enumerate(result.names, 1)
     ]
-    for said, name, value, s, p in zip(
+    for owner, name, value, s, p in zip(
         numbered, result.names, result.estimate, result.inspection.sigma, result.prior_sigma
     ):
         prior = "free" if np.isinf(p) else f"{p * name.factor:.4g}"
-        rows.append((said, *estimate(value * name.factor, s * name.factor), prior, name.unit))
+        rows.append((owner, *estimate(value * name.factor, s * name.factor), prior, name.unit))
     parts = [grid(("unknown", "change", "σ", "σ of prior", "unit"), rows)]
     if shows_matrix:
         parts += [
@@ -117,12 +117,12 @@ def _unknowns(result: Refinement) -> Section:
     return Section("unknowns", "Unknowns of the images", "".join(parts), "Unknowns")
 
 
-def _images(result: Refinement, used: Sequence[ImagePoint]) -> Columns:
+def _images(result: Refinement, used_points: Sequence[ImagePoint]) -> Columns:
     camera, rms = [], []
     for id in result.inspection.declared.inputs.ids:
-        v = np.array([row["v"] for row in used if row["image"] == id]).reshape(-1, 2)
+        v = np.array([row["v"] for row in used_points if row["image"] == id]).reshape(-1, 2)
         rms.append(np.sqrt((v**2).sum(1).mean()) if len(v) else np.nan)
-    scanners = [one.id for one in result.images]
+    scanners = [scanner_image.id for scanner_image in result.images]
     if result.frames is not None:
         camera = [result.frames.cameras[c].id for c in result.frames.images.camera]
     return {
@@ -134,12 +134,12 @@ def _images(result: Refinement, used: Sequence[ImagePoint]) -> Columns:
 
 def _points(result: Refinement) -> Columns:
     rows = point_rows(result)
-    found = {
+    columns = {
         "id": Column(_words(row["id"] for row in rows), "point"),
         "role": Column(_words(row["role"] for row in rows), "role"),
     }
-    found |= {a: Column(numbers(row[a] for row in rows), f"{a} [m]", 3, True) for a in "XYZ"}
-    return found | {
+    columns |= {a: Column(numbers(row[a] for row in rows), f"{a} [m]", 3, True) for a in "XYZ"}
+    return columns | {
         f"s{a}": Column(numbers(row[f"s{a}"] for row in rows), f"σ{a} [m]") for a in "XYZ"
     }
 
@@ -149,11 +149,11 @@ def _checks(result: Refinement) -> Columns:
     if check is None:
         return {}
     axes = ("X", "Y", "Z") if result.images[0].earth is None else ("east", "north", "up")
-    found = {"id": Column(_words(check.id), "point")}
+    columns = {"id": Column(_words(check.id), "point")}
     for k, axis in enumerate(axes):
-        found[f"d{k}"] = Column(check.difference[:, k], f"d {axis} [m]")
-        found[f"s{k}"] = Column(check.sigma[:, k], f"σ {axis} [m]")
-    return found | {"rays": Column(np.asarray(check.rays), "rays")}
+        columns[f"d{k}"] = Column(check.difference[:, k], f"d {axis} [m]")
+        columns[f"s{k}"] = Column(check.sigma[:, k], f"σ {axis} [m]")
+    return columns | {"rays": Column(np.asarray(check.rays), "rays")}
 
 
 def _terrain_heights(result: Refinement) -> Columns:
@@ -168,40 +168,44 @@ def _terrain_heights(result: Refinement) -> Columns:
     }
 
 
-def _observations(used: Sequence[ImagePoint]) -> Columns:
+def _observations(used_points: Sequence[ImagePoint]) -> Columns:
     """One row per coordinate, as for an adjustment; `tau`, the drawn test, is w."""
-    both = lambda name: np.concatenate([row[name] for row in used])
-    twice = lambda name: _words(row[name] for row in used for _ in range(2))
+    both_coordinates = lambda name: np.concatenate([row[name] for row in used_points])
+    for_both = lambda name: _words(row[name] for row in used_points for _ in range(2))
     return {
-        "kind": Column(np.full(2 * len(used), "image", dtype=object)),
-        "image": Column(twice("image"), "image"),
-        "point": Column(twice("point"), "point"),
-        "axis": Column(_words(axis for row in used for axis in row["axes"]), "axis"),
-        "measured": Column(both("measured"), "measured", 3),
-        "v": Column(both("v"), "v"),
-        "r": Column(both("r"), "r", 3),
-        "tau": Column(both("w"), "w", 2),
+        "kind": Column(np.full(2 * len(used_points), "image", dtype=object)),
+        "image": Column(for_both("image"), "image"),
+        "point": Column(for_both("point"), "point"),
+        "axis": Column(_words(axis for row in used_points for axis in row["axes"]), "axis"),
+        "measured": Column(both_coordinates("measured"), "measured", 3),
+        "v": Column(both_coordinates("v"), "v"),
+        "r": Column(both_coordinates("r"), "r", 3),
+        "tau": Column(both_coordinates("w"), "w", 2),
     }
 
 
 def _frames(result: Refinement) -> dict[str, dict]:
     """By camera, and scanner image, what is drawn: pixels to the right, lines down."""
-    frame = lambda low, high, known, down, unit: {
+    frame = lambda low, high, is_known, y_down, unit: {
         "low": low,
         "high": high,
-        "known": known,
-        "down": down,
+        "known": is_known,
+        "down": y_down,
         "scale": 1.0,
         "unit": unit,
         "centre": None,
     }
-    found = {
-        f"scanner {one.id}": frame(
-            [0.0, 0.0], [one.image.pixels - 1.0, one.image.lines - 1.0], True, True, "px"
+    frames = {
+        f"scanner {scanner_image.id}": frame(
+            [0.0, 0.0],
+            [scanner_image.image.pixels - 1.0, scanner_image.image.lines - 1.0],
+            True,
+            True,
+            "px",
         )
-        for one in result.images
+        for scanner_image in result.images
     }
     for camera in () if result.frames is None else result.frames.cameras:
         model = get_model(camera.model)
-        found[camera.id] = frame([0.0, 0.0], [0.0, 0.0], False, model.axes == "down", model.unit)
-    return found
+        frames[camera.id] = frame([0.0, 0.0], [0.0, 0.0], False, model.axes == "down", model.unit)
+    return frames

@@ -28,8 +28,8 @@ def describe_network(adjustment: "Adjustment") -> dict[str, Any]:
     and stations that have one, in words, and whether those of stations are too wide to be drawn;
     the pyramid of every image (projection centre and four corners, relative to the centre)."""
     centres = adjustment.image_values[:, :3]
-    near = adjustment.point_values[adjustment.located]
-    centre, size = extent(np.concatenate([near, centres]))
+    located_points = adjustment.point_values[adjustment.located]
+    centre, size = extent(np.concatenate([located_points, centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size)) - centre
     ellipsoids = choose_ellipses(adjustment, size, SCENE)
     largest = np.sqrt(np.trace(adjustment.image_covariance[:, :3, :3], axis1=1, axis2=2))
@@ -64,13 +64,13 @@ def describe_frames(adjustment: "Adjustment") -> dict[str, dict[str, Any]]:
     frames = {}
     for camera in adjustment.problem.network.cameras:
         model = get_model(camera.model)
-        low, high, known = image_frame(adjustment, camera.id)
+        low, high, is_known = image_frame(adjustment, camera.id)
         scale, unit = micrometres(model.unit)
         centre = principal_point(adjustment, camera.id)
         frames[camera.id] = {
             "low": low.tolist(),
             "high": high.tolist(),
-            "known": bool(known),
+            "known": bool(is_known),
             "down": model.axes == "down",
             "scale": scale,
             "unit": unit,

@@ -80,8 +80,8 @@ def photographs(test: str = "τ") -> Section:
 def cameras(adjustment: "Adjustment", max_cameras: int = 20) -> Iterator[Section]:
     """Equations, distortion and correlations of the cameras; of more than `max_cameras` the first,
     since each has a drawing: the table has all."""
-    chosen = list(adjustment.cameras)[:max_cameras]
-    for number, camera in enumerate(chosen):
+    listed = list(adjustment.cameras)[:max_cameras]
+    for number, camera in enumerate(listed):
         entry = adjustment.cameras[camera]
         model = get_model(entry["model"])
         parts = [items(camera_equations(model)), _distortion(adjustment, camera)]
@@ -93,9 +93,9 @@ def cameras(adjustment: "Adjustment", max_cameras: int = 20) -> Iterator[Section
                     entry["free"], entry.get("correlations_correlated", entry["correlations"])
                 ),
             ]
-        others = len(adjustment.cameras) - len(chosen)
-        if others and number == len(chosen) - 1:
-            parts.append(paragraph(f"{others} other cameras are in the table."))
+        number_of_others = len(adjustment.cameras) - len(listed)
+        if number_of_others and number == len(listed) - 1:
+            parts.append(paragraph(f"{number_of_others} other cameras are in the table."))
         id, link = ("distortion", "Distortion") if number == 0 else (f"distortion-{number}", "")
         yield Section(id, f"Camera {camera}: {entry['model']}", "".join(parts), link)
 
@@ -104,30 +104,30 @@ def _distortion(adjustment: "Adjustment", camera: str) -> str:
     measured, reach = curve_reach(adjustment, camera)
     if not reach > 0:
         return ""
-    found = distortion_profile(adjustment, camera, reach=reach)
-    scale, unit = micrometres(found.unit)
+    profile = distortion_profile(adjustment, camera, reach=reach)
+    scale, unit = micrometres(profile.unit)
     curves = [
         Curve(
             "symmetric radial, band ±σ",
-            found.radius,
-            scale * found.radial,
-            scale * found.radial_sigma,
+            profile.radius,
+            scale * profile.radial,
+            scale * profile.radial_sigma,
         )
     ]
-    if np.nan_to_num(found.decentring).any() or np.nan_to_num(found.decentring_sigma).any():
+    if np.nan_to_num(profile.decentring).any() or np.nan_to_num(profile.decentring_sigma).any():
         curves.append(
             Curve(
                 "decentring, band ±σ",
-                found.radius,
-                scale * found.decentring,
-                scale * found.decentring_sigma,
+                profile.radius,
+                scale * profile.decentring,
+                scale * profile.decentring_sigma,
                 "second",
             )
         )
     mark = (measured, "farthest measurement") if measured < reach else None
     drawing = draw_curves(
         curves,
-        f"distance from the principal point [{found.unit}]",
+        f"distance from the principal point [{profile.unit}]",
         f"measured − ideal [{unit}]",
         mark=mark,
     )
@@ -169,18 +169,20 @@ def residuals(adjustment: "Adjustment") -> Section:
         for name, c in adjustment.variance_components.items()
     ]
     header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂", "unit")
-    more = "<h3>Variance components</h3>\n" + grid(header, components, "remarks")
-    return show_residuals(adjustment.residuals["tau"], more=more)
+    components_part = "<h3>Variance components</h3>\n" + grid(header, components, "remarks")
+    return show_residuals(adjustment.residuals["tau"], further_content=components_part)
 
 
-def show_residuals(test: np.ndarray, symbol: str = "τ = w/σ0", more: str = "") -> Section:
+def show_residuals(
+    test: np.ndarray, symbol: str = "τ = w/σ0", further_content: str = ""
+) -> Section:
     """The histogram of test values, with the normal distribution."""
     edges, counted, expected = count_by_class(test)
     drawing = figure(
         draw_histogram(edges, counted, f"normalised residual {symbol}", "observations", expected),
         f"Normalised residuals of {counted.sum()} controlled observations; outer classes are open",
     )
-    return Section("residuals", "Normalised residuals", drawing + more, "Residuals")
+    return Section("residuals", "Normalised residuals", drawing + further_content, "Residuals")
 
 
 def predicted_control(adjustment: "Adjustment") -> Iterator[Section]:
@@ -212,7 +214,7 @@ def correlated_errors(adjustment: "Adjustment") -> Iterator[Section]:
     elif adjustment.error_model is not None:
         parts = [
             grid(correlated.COMPONENT_HEADER, correlated.component_rows(adjustment)),
-            *(paragraph(said) for said in correlated.remarks(adjustment)),
+            *(paragraph(remark) for remark in correlated.remarks(adjustment)),
             paragraph(correlated.LEGEND),
         ]
         if words := correlated.not_looked_for(adjustment.error_model):
@@ -234,13 +236,13 @@ def correlated_errors(adjustment: "Adjustment") -> Iterator[Section]:
 
 def convergence(adjustment: "Adjustment") -> Section:
     """vᵀPv of the steps."""
-    vtpv, damping, accepted = head.evaluations(adjustment)
-    there = np.isfinite(vtpv) & (vtpv > 0)
+    vtpv, damping, is_accepted = head.evaluations(adjustment)
+    is_positive = np.isfinite(vtpv) & (vtpv > 0)
     step = np.arange(len(vtpv))
     drawing = ""
     # A smaller fall than 1e-5 cannot be seen in the six digits of the table either.
-    if there.sum() > 1 and vtpv[there].max() > (1 + 1e-5) * vtpv[there].min():
-        curve = Curve("vᵀPv", step[there], np.log10(vtpv[there]))
+    if is_positive.sum() > 1 and vtpv[is_positive].max() > (1 + 1e-5) * vtpv[is_positive].min():
+        curve = Curve("vᵀPv", step[is_positive], np.log10(vtpv[is_positive]))
         drawing = figure(
             draw_curves([curve], "iteration", "vᵀPv", logarithmic="y"),
             f"{head.result_in_words(adjustment)}: {adjustment.termination}",
@@ -250,7 +252,7 @@ def convergence(adjustment: "Adjustment") -> Section:
             i or "start",
             f"{vtpv[i]:.5e}" if np.isfinite(vtpv[i]) else "not finite",
             f"{damping[i]:.1e}" if i else "",
-            ("accepted" if accepted[i] else "rejected") if i else "",
+            ("accepted" if is_accepted[i] else "rejected") if i else "",
         )
         for i in step
     ]

@@ -46,43 +46,46 @@ def collect_tables(adjustment: "Adjustment") -> dict[str, Listing]:
 
 def cameras(adjustment: "Adjustment") -> Columns:
     """One row per parameter."""
-    found = adjustment.table("cameras")
+    columns = adjustment.table("cameras")
     parameters = [
         entry for camera in adjustment.cameras.values() for entry in camera["parameters"].values()
     ]
     sigma = numbers(stated_sigma_of(entry) for entry in parameters)
     classical = {}
-    if "sigma_correlated" in found:
-        classical["classical"] = Column(numbers(found["sigma"]), "σ classical")
+    if "sigma_correlated" in columns:
+        classical["classical"] = Column(numbers(columns["sigma"]), "σ classical")
     return {
-        "camera": Column(found["camera"], "camera"),
-        "model": Column(found["model"], "model"),
-        "parameter": Column(found["parameter"], "parameter"),
-        "value": estimates(numbers(found["value"]), sigma, "value"),
+        "camera": Column(columns["camera"], "camera"),
+        "model": Column(columns["model"], "model"),
+        "parameter": Column(columns["parameter"], "parameter"),
+        "value": estimates(numbers(columns["value"]), sigma, "value"),
         "sigma": Column(sigma, "σ"),
         **classical,
-        "free": Column(found["free"].astype(bool), "free"),
-        "t": Column(numbers(found["t"]), "t = |value|/σ"),
-        "total": Column(100 * numbers(found["total_correlation"]), "total correlation %", 1),
+        "free": Column(columns["free"].astype(bool), "free"),
+        "t": Column(numbers(columns["t"]), "t = |value|/σ"),
+        "total": Column(100 * numbers(columns["total_correlation"]), "total correlation %", 1),
     }
 
 
 def images(adjustment: "Adjustment") -> Columns:
     """Exterior orientation; the covariance of the projection centre, to be drawn."""
-    found, given = adjustment.images, adjustment.problem.network
-    unit, angle = clean(given.object_unit), given.angle_unit
+    columns, network = adjustment.images, adjustment.problem.network
+    unit, angle = clean(network.object_unit), network.angle_unit
     units = dict(zip(EXTERIOR, [unit] * 3 + [angle] * 3))
     label = lambda name: f"{ANGLES.get(name, name)} [{units[name]}]"
-    sigma = {name: stated_sigma(found, name) for name in EXTERIOR}
+    sigma = {name: stated_sigma(columns, name) for name in EXTERIOR}
     places = {name: coordinate_decimals(sigma[name]) for name in EXTERIOR}
-    ids = np.array([camera.id for camera in given.cameras], dtype=object)
+    ids = np.array([camera.id for camera in network.cameras], dtype=object)
     return (
-        {"id": Column(found["id"], "image"), "camera": Column(ids[given.images.camera], "camera")}
-        | {name: Column(found[name], label(name), places[name], True) for name in EXTERIOR}
+        {
+            "id": Column(columns["id"], "image"),
+            "camera": Column(ids[network.images.camera], "camera"),
+        }
+        | {name: Column(columns[name], label(name), places[name], True) for name in EXTERIOR}
         | {f"s{name}": Column(sigma[name], f"σ {label(name)}") for name in EXTERIOR}
         | {
-            "rays": Column(found["rays"], "rays"),
-            "rms": Column(found["rms"], f"RMS v [{adjustment.image_unit}]"),
+            "rays": Column(columns["rays"], "rays"),
+            "rms": Column(columns["rms"], f"RMS v [{adjustment.image_unit}]"),
         }
         | _covariance(adjustment.image_covariance[:, :3, :3])
     )
@@ -90,16 +93,16 @@ def images(adjustment: "Adjustment") -> Columns:
 
 def points(adjustment: "Adjustment") -> Columns:
     """Coordinates with σ; the covariance, and whether a point is near enough to be drawn."""
-    found, unit = adjustment.points, clean(adjustment.network.object_unit)
-    sigma = {axis: stated_sigma(found, axis) for axis in "XYZ"}
+    columns, unit = adjustment.points, clean(adjustment.network.object_unit)
+    sigma = {axis: stated_sigma(columns, axis) for axis in "XYZ"}
     places = {axis: coordinate_decimals(sigma[axis]) for axis in "XYZ"}
     return (
-        {"id": Column(found["id"], "point"), "role": Column(found["role"], "role")}
-        | {a: Column(found[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
+        {"id": Column(columns["id"], "point"), "role": Column(columns["role"], "role")}
+        | {a: Column(columns[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
         | {f"s{a}": Column(sigma[a], f"σ{a} [{unit}]") for a in "XYZ"}
         | {
-            "rays": Column(found["rays"], "rays"),
-            "rms": Column(found["rms"], f"RMS v [{adjustment.image_unit}]"),
+            "rays": Column(columns["rays"], "rays"),
+            "rms": Column(columns["rms"], f"RMS v [{adjustment.image_unit}]"),
             "near": Column(adjustment.located.astype(int)),
         }
         | _covariance(adjustment.point_covariance)
@@ -112,7 +115,7 @@ def _covariance(matrices: Float[np.ndarray, "n 3 3"]) -> Columns:
 
 def far_points(adjustment: "Adjustment") -> Columns:
     """Directions of the points at any distance."""
-    found = adjustment.table("far_points")
+    columns = adjustment.table("far_points")
     network = adjustment.network
     labels = {
         "id": "point",
@@ -128,22 +131,22 @@ def far_points(adjustment: "Adjustment") -> Columns:
     directions = ("uX", "uY", "uZ")
     return {
         name: Column(column, labels[name], 6 if name in directions else -3)
-        for name, column in found.items()
+        for name, column in columns.items()
     }
 
 
 def checks(adjustment: "Adjustment") -> Columns:
     """Check points: intersected, minus given, σ."""
-    found, unit = adjustment.table("checks"), clean(adjustment.network.object_unit)
-    if not found:
+    columns, unit = adjustment.table("checks"), clean(adjustment.network.object_unit)
+    if not columns:
         return {}
-    places = {axis: coordinate_decimals(found[f"s{axis}"]) for axis in "XYZ"}
+    places = {axis: coordinate_decimals(columns[f"s{axis}"]) for axis in "XYZ"}
     return (
-        {"id": Column(found["id"], "point")}
-        | {a: Column(found[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
-        | {f"d{a}": Column(found[f"d{a}"], f"d{a} [{unit}]") for a in "XYZ"}
-        | {f"s{a}": Column(found[f"s{a}"], f"σ{a} [{unit}]") for a in "XYZ"}
-        | {"rays": Column(found["rays"], "rays")}
+        {"id": Column(columns["id"], "point")}
+        | {a: Column(columns[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
+        | {f"d{a}": Column(columns[f"d{a}"], f"d{a} [{unit}]") for a in "XYZ"}
+        | {f"s{a}": Column(columns[f"s{a}"], f"σ{a} [{unit}]") for a in "XYZ"}
+        | {"rays": Column(columns["rays"], "rays")}
     )
 
 
@@ -154,9 +157,9 @@ def observations(adjustment: "Adjustment") -> Columns:
     )
 
 
-def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Columns:
+def table_of_residuals(columns: Mapping[str, np.ndarray], sigma0: float) -> Columns:
     """The columns there are of a table of residuals."""
-    chosen = choose_largest(found["tau"], MAX_OBSERVATIONS)
+    largest_rows = choose_largest(columns["tau"], MAX_OBSERVATIONS)
     labels = {
         "kind": "kind",
         "image": "image",
@@ -173,21 +176,21 @@ def table_of_residuals(found: Mapping[str, np.ndarray], sigma0: float) -> Column
         "external": "ext.",
         "weight": "weight",
     }
-    of_images = found["sigma"][found["kind"] == "image"]
+    of_images = columns["sigma"][columns["kind"] == "image"]
     places = {"r": 3, "tau": 2, "w": 2, "measured": coordinate_decimals(sigma0 * of_images)}
     return {
-        name: Column(found[name][chosen], label, places.get(name, -3))
+        name: Column(columns[name][largest_rows], label, places.get(name, -3))
         for name, label in labels.items()
-        if name in found
+        if name in columns
     }
 
 
-def choose_largest(tau: np.ndarray, most: int) -> np.ndarray:
+def choose_largest(tau: np.ndarray, max_rows: int) -> np.ndarray:
     """The rows with the largest |τ|, limited in number, in their order."""
-    if len(tau) <= most:
+    if len(tau) <= max_rows:
         return np.arange(len(tau))
     # A partition needs no order among the largest.
-    return np.sort(np.argpartition(-np.abs(np.nan_to_num(tau)), most)[:most])
+    return np.sort(np.argpartition(-np.abs(np.nan_to_num(tau)), max_rows)[:max_rows])
 
 
 def blunders(adjustment: "Adjustment") -> Columns:
