@@ -57,11 +57,11 @@ def abbreviate(value: Any, depth: int = 0) -> str:
         text = " ".join(str(value).split()) if short else f"{value.dtype}{[*value.shape]}"
     elif isinstance(value, Mapping) and type(value).__repr__ is not describe:
         parts = [f"{k!r}: {abbreviate(value[k], depth + 1)}" for k in [*value][:SHOWN_ENTRIES]]
-        text = f"{{{', '.join(_more(parts, len(value), depth))}}}"
+        text = f"{{{', '.join(_with_total(parts, len(value), depth))}}}"
     elif isinstance(value, tuple | list):
         parts = [abbreviate(name, depth + 1) for name in value[:SHOWN_ENTRIES]]
         text = "({})" if isinstance(value, tuple) else "[{}]"
-        text = text.format(", ".join(_more(parts, len(value), depth)))
+        text = text.format(", ".join(_with_total(parts, len(value), depth)))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         size = getattr(value, "__len__", None)
         number = "" if size is None else f" of {size()}"
@@ -71,7 +71,7 @@ def abbreviate(value: Any, depth: int = 0) -> str:
     return text if len(text) <= WIDTH - 24 else f"{text[: WIDTH - 25]}…"
 
 
-def _more(parts: list[str], number: int, depth: int) -> list[str]:
+def _with_total(parts: list[str], number: int, depth: int) -> list[str]:
     """The parts, and the number of all if some are omitted; at depth only the number."""
     if depth > 1 and number:
         return [f"{number} entries"]

@@ -103,7 +103,7 @@ class SizedParts(NamedTuple):
     pose: Float[np.ndarray, "cameras k views 6"]
 
     @staticmethod
-    def of(sums: BatchSums, parts: ComponentParts | None) -> "SizedParts":
+    def from_sums(sums: BatchSums, parts: ComponentParts | None) -> "SizedParts":
         """Without any widening; None: independent errors alone."""
         factor = np.ones(sums.forms.q.shape)
         if parts is None:
@@ -143,8 +143,8 @@ def _sizes_of_each(
     is_used: np.ndarray = np.nan_to_num(theta) > 0
     shared = np.asarray(is_used[:, 1:].any(1))
     if not shared.any():
-        return theta, SizedParts.of(sums, None)
-    parts = SizedParts.of(sums, programs.parts(is_used & shared[:, None]))
+        return theta, SizedParts.from_sums(sums, None)
+    parts = SizedParts.from_sums(sums, programs.parts(is_used & shared[:, None]))
     forms = programs.scatter(np.where(shared[:, None], np.nan_to_num(theta), 0.0))
     for n in np.flatnonzero(shared).tolist():
         components = np.flatnonzero(can_show[n])
@@ -173,7 +173,7 @@ def _common_sizes(
     if not (can_show[:, 0] & sums.traced).any():
         # Without any traces independent errors alone.
         theta[known_cameras, 0] = white(0.0)
-        return theta, SizedParts.of(sums, None)
+        return theta, SizedParts.from_sums(sums, None)
     components = np.flatnonzero(can_show[np.argmax(can_show.sum(1) * sums.traced)])
     block = np.ix_(components, components)
     good = np.flatnonzero(can_show[:, components].all(1))
@@ -188,14 +188,14 @@ def _common_sizes(
     theta[np.ix_(known_cameras, components)] = common
     if not common[1:].any():
         theta[known_cameras, 0] = white(0.0)
-        return theta, SizedParts.of(sums, None)
+        return theta, SizedParts.from_sums(sums, None)
     is_wanted = np.zeros(can_show.shape, bool)
     is_wanted[np.ix_(known_cameras, components)] = common > 0
     parts_found = programs.parts(is_wanted)
     theta[known_cameras, 0] = white(
         parts_found.remaining[known_cameras][:, components[1:]] @ common[1:]
     )
-    parts = SizedParts.of(sums, parts_found)
+    parts = SizedParts.from_sums(sums, parts_found)
     if len(traced) >= 2 * SUMS.draws:
         # q of that many cameras are draws themselves, of errors as they are
         deviation = q[traced][:, components] - T[traced][:, components][..., components] @ common

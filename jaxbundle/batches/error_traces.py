@@ -66,7 +66,7 @@ class FewColumns(NamedTuple):
     by_view: Float[Array, "m m"]
 
     @staticmethod
-    def of(roots: Roots, projected: OntoSpans) -> "FewColumns":
+    def from_roots(roots: Roots, projected: OntoSpans) -> "FewColumns":
         WB, ZB, WF, ZF = projected
         views, columns = WF.shape[0], WF.shape[2]
         field = jax.scipy.linalg.block_diag(roots.gram, roots.gram)
@@ -107,7 +107,7 @@ def random_signs(settings: CorrelationSettings, views: int, points: int) -> tupl
 
 def traces_of_components(spans: Spans, roots: Roots, signs: tuple[Array, Array]) -> ComponentTraces:
     projected = onto_spans(spans, roots)
-    S, count = in_single_precision(FewColumns.of(roots, projected)), len(COMPONENTS)
+    S, count = in_single_precision(FewColumns.from_roots(roots, projected)), len(COMPONENTS)
     T, cubes = S.sums(S), jnp.zeros((count,) * 3)
     # S_ij·S_jk of every j
     through = FewColumns(S.field @ S.field, S.mixed @ S.field, S.mixed @ S.mixed.T)

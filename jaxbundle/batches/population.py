@@ -84,14 +84,14 @@ class Population:
         self.values = {name: column(name, "value") for name in names}
         self.sigma = {name: column(name, "sigma") for name in names}
         self.apart = {
-            name: np.abs(self._apart(values, self.sigma[name]))
+            name: np.abs(self._deviations(values, self.sigma[name]))
             for name, values in self.values.items()
         }
         # Views that determine nothing: weak without values.
         self._void = np.array(
             [row.get("status") == STATUS[WEAK] and not row["parameters"] for row in kept_rows], bool
         )
-        self.rms_apart = self._apart(self.numbers["rms"], np.zeros(len(kept_rows)))
+        self.rms_apart = self._deviations(self.numbers["rms"], np.zeros(len(kept_rows)))
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -114,7 +114,7 @@ class Population:
         middle = float(np.median(known_values))
         return middle, NORMAL_SIGMA_BY_MAD * float(np.median(np.abs(known_values - middle)))
 
-    def _apart(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    def _deviations(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         middle, deviation = self.spread(values)
         number = (self.fit & np.isfinite(values)).sum()
         if number < self.settings.min_cameras or not deviation > 0:

@@ -69,7 +69,7 @@ class SolvedPortions(NamedTuple):
         """Those of some cameras."""
         number = len(COMPONENTS)
         T, cubes = (np.zeros((self.cameras, *(number,) * n)) for n in (2, 3))
-        for portion, rows, wanted_of_portion in self._wanted(is_wanted):
+        for portion, rows, wanted_of_portion in self._wanted_portions(is_wanted):
             traces_found = traces_of_portion(
                 self.key, DEFAULTS, *_adjusted(portion, rows), wanted_of_portion
             )
@@ -81,7 +81,7 @@ class SolvedPortions(NamedTuple):
         number, k = len(COMPONENTS), len(self.key.free)
         remaining, interior = (np.zeros((self.cameras, number, *n)) for n in ((), (k, k)))
         pose = np.zeros((self.cameras, number, self.views, POSE))
-        for portion, rows, wanted_of_portion in self._wanted(is_wanted):
+        for portion, rows, wanted_of_portion in self._wanted_portions(is_wanted):
             adjusted = *_adjusted(portion, rows), portion.axes, portion.middle
             parts_found = parts_of_portion(self.key, DEFAULTS, *adjusted, wanted_of_portion)
             remaining[portion.cameras], interior[portion.cameras], padded = _without_padding(
@@ -97,14 +97,14 @@ class SolvedPortions(NamedTuple):
     def scatter(self, theta: Float[np.ndarray, "cameras k"]) -> Float[np.ndarray, "cameras k k"]:
         """The covariances of the forms of all cameras under errors of these sizes."""
         covariances = np.zeros((self.cameras, len(COMPONENTS), len(COMPONENTS)))
-        for portion, rows, theta_of_portion in self._wanted(theta):
+        for portion, rows, theta_of_portion in self._wanted_portions(theta):
             forms = scatter_of_portion(
                 self.key, DEFAULTS, *_adjusted(portion, rows), theta_of_portion
             )
             (covariances[portion.cameras],) = _without_padding(portion, [forms])
         return covariances
 
-    def _wanted(self, wanted_of_all: Shaped[np.ndarray, "cameras *axes"]) -> Any:
+    def _wanted_portions(self, wanted_of_all: Shaped[np.ndarray, "cameras *axes"]) -> Any:
         """The portions with rows in which something is wanted, and what, filled up with zeros."""
         for portion, rows in zip(self.portions, self.rows):
             wanted_of_portion = wanted_of_all[portion.cameras]

@@ -160,16 +160,16 @@ class BatchSettings:
     def of_cameras(self) -> dict:
         """Settings of the lines of cameras and rigs."""
         settings = {"model": self.named, "free": list(free_parameters(self.model, self.free))}
-        settings |= {**self.adjusting, **self._asked, "brief": self.brief, **self.sections()}
+        settings |= {**self.adjusting, **self._correlated_setting, "brief": self.brief, **self.sections()}
         return settings | ({} if self.pixel_size is None else {"pixel_size": self.pixel_size})
 
     def of_networks(self) -> dict:
         """Settings of the lines of networks."""
-        settings = {**self.adjusting, **self._asked}
+        settings = {**self.adjusting, **self._correlated_setting}
         return settings | ({"set": list(self.overrides)} if self.overrides else {})
 
     @property
-    def _asked(self) -> dict:
+    def _correlated_setting(self) -> dict:
         # Lines of earlier versions do not have it.
         return {"correlated": True} if self.correlated else {}
 

@@ -48,7 +48,7 @@ def turning_radius(
         # Up to 200 times the half diagonal, dense near it: a barrel distortion brings far points
         # into the image.
         radii = radius_max * t / (1.005 - t)
-    determinant, measured = map(np.asarray, _along(model, p, azimuth[:, None], radii[None, :]))
+    determinant, measured = map(np.asarray, _determinant_along(model, p, azimuth[:, None], radii[None, :]))
     # NaN, beyond the range of a formula, counts as turned.
     turned = ~(determinant > 0)
     first_turn = (turned | (measured > radius_max)).argmax(1)
@@ -59,10 +59,10 @@ def turning_radius(
     inner, outer = radii[np.maximum(first_turn - 1, 0)], radii[first_turn]
     for _ in range(50):  # 2⁻⁵⁰ of a step: rounding
         middle = (inner + outer) / 2
-        good = np.asarray(_along(model, p, azimuth, middle)[0]) > 0
+        good = np.asarray(_determinant_along(model, p, azimuth, middle)[0]) > 0
         inner, outer = np.where(good, middle, inner), np.where(good, outer, middle)
     # Where the image ends instead of turning back, there is none at `outer`.
-    radius = float(np.min(_along(model, p, azimuth, inner)[1]))
+    radius = float(np.min(_determinant_along(model, p, azimuth, inner)[1]))
     return radius if radius <= radius_max else None
 
 
@@ -108,7 +108,7 @@ def _in_order(
 
 
 @partial(compile_once, static=0)
-def _along(
+def _determinant_along(
     model: CameraModel, p: tuple[Scalar, ...], azimuth: AnyArray, radius: AnyArray
 ) -> tuple[Array, Array]:
     """Jacobian determinant and radius in the measured image, `radius` out from the centre."""

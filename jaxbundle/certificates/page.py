@@ -60,7 +60,7 @@ def compose_certificate(certificate: "Certificate") -> Iterator[str]:
     details = certificate.details.fields
     title = certificate.title + (f" {details['number']}" if "number" in details else "")
     sections = [
-        _first(certificate),
+        _result_section(certificate),
         *_results(certificate),
         *_rig(certificate),
         *_acceptance(certificate),
@@ -77,7 +77,7 @@ def compose_certificate(certificate: "Certificate") -> Iterator[str]:
 # --- first screen ---------------------------------------------------------------------------
 
 
-def _first(certificate: "Certificate") -> Section:
+def _result_section(certificate: "Certificate") -> Section:
     parts = [_cards(find_cards(certificate)), *map(_picture, certificate.parts[:1])]
     return Section("certificate", "Result", "".join([*parts, _identity(certificate)]))
 

@@ -145,7 +145,7 @@ def _pitch(cameras: Any) -> PixelPitch:
     return NO_PITCH
 
 
-def _split(argument: str) -> tuple[str, str, str]:
+def _split_argument(argument: str) -> tuple[str, str, str]:
     """KIND, ID and NAME of an argument: a parameter alone is that of all cameras, images or
     points."""
     kind, mark, after_kind = argument.partition(":")
@@ -175,7 +175,7 @@ def _parameters(
 ) -> QuantityValues:
     """A number for each of the named unknowns that are estimated."""
     adjustment: Adjustment = subject.result
-    kind, id, name = _split(argument)
+    kind, id, name = _split_argument(argument)
     network = adjustment.problem.network
     if kind == "camera":
         return _of_cameras(adjustment, id, name, of_camera, unit_less)

@@ -39,7 +39,7 @@ def attitude_forms(angles: Mapping[str, Any], duration: float) -> AttitudeForms:
     for name in NAMES:
         values = {}
         for key, (kind, entry) in FORM.items():
-            k = _first(_parts(angles, name), kind)
+            k = _index_of_kind(_parts(angles, name), kind)
             if k is None:
                 values[key] = shorten_number(duration, 4) if key == "period" else 0.0
             else:
@@ -100,7 +100,7 @@ def _parts(angles: Mapping[str, Any], name: str) -> list[Any]:
     return list(parts) if isinstance(parts, list | tuple) else [parts]
 
 
-def _first(parts: list[Any], kind: str) -> int | None:
+def _index_of_kind(parts: list[Any], kind: str) -> int | None:
     """The index of the first signal of a kind."""
     kinds = [part.get("kind", "constant") if isinstance(part, Mapping) else None for part in parts]
     return kinds.index(kind) if kind in kinds else None
@@ -111,7 +111,7 @@ def _change(
 ) -> None:
     """Change the first signal of a kind; a new one is last, so that the random numbers of the
     others, which follow from their places, stay."""
-    k = _first(parts, kind)
+    k = _index_of_kind(parts, kind)
     if k is None:
         parts.append({"kind": kind, **otherwise})
         k = len(parts) - 1

@@ -94,7 +94,7 @@ def draw_ground(
         P[2] = 0.0
         curves.append(curve("track, from above", P, "given"))
     elif earth.a == earth.b:
-        curves.append(curve("ground track, below the platform", _below(earth, P), "given"))
+        curves.append(curve("ground track, below the platform", _on_ellipsoid(earth, P), "given"))
     return figure(
         draw_plan(curves, "east [km]", "north [km]"),
         "Relative to the image centre; both axes at one scale",
@@ -171,6 +171,6 @@ def _angles(image: PushbroomImage, lines: Float[Array, " n"], orbital: bool) -> 
 
 
 @jax.jit
-def _below(earth: Ellipsoid, P: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+def _on_ellipsoid(earth: Ellipsoid, P: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
     longitude, latitude, _ = geodetic(earth, tuple(P))
     return jnp.stack(earth_fixed(earth, (longitude, latitude, 0 * longitude)))

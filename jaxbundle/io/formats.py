@@ -309,7 +309,7 @@ def _is_named(name: str) -> Callable[[Path], bool]:
     return lambda path: path.name.lower() == name
 
 
-def _first(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera], Path], None]:
+def _write_only_camera(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera], Path], None]:
     """Writes the only camera."""
     return lambda cameras, path: write(cameras[0], path)
 
@@ -491,7 +491,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
     ),
     "ros": CameraTarget(
         _file_of("camera_info", *YAML),
-        _first(write_ros),
+        _write_only_camera(write_ros),
         "NAME.yaml with camera_info in its name",
         PIXEL_MODELS,
         one=True,
@@ -499,7 +499,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
     ),
     "cameramodel": CameraTarget(
         _ends(".cameramodel"),
-        _first(write_cameramodel),
+        _write_only_camera(write_cameramodel),
         "NAME.cameramodel",
         MRCAL_MODELS,
         one=True,
@@ -507,7 +507,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
     ),
     "autocal": CameraTarget(
         _file_of("autocal", ".xml"),
-        _first(write_autocal),
+        _write_only_camera(write_autocal),
         "NAME.xml with autocal in its name",
         MICMAC_MODELS,
         one=True,
@@ -515,7 +515,7 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
     ),
     "opencv": CameraTarget(
         _ends(*YAML, ".json"),
-        _first(write_opencv),
+        _write_only_camera(write_opencv),
         "NAME.yaml, .yml, .json",
         PIXEL_MODELS,
         one=True,

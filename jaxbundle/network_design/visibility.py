@@ -131,7 +131,7 @@ def margins(
         cosine = -(sight @ normal) / length
         by_condition["incidence"] = jnp.asarray(cosine - rules.cos_incidence)[None]
     if rules.obstacles is not None:
-        hidden = lambda box: _outside(box, point, position, softness)
+        hidden = lambda box: _length_in_box(box, point, position, softness)
         by_condition["obstacles"] = jax.vmap(hidden)(rules.obstacles)
     return by_condition
 
@@ -207,7 +207,7 @@ def _within(x: Float[Array, ""], ends: Float[AnyArray, "2"]) -> Float[Array, "2"
     return jnp.stack([x - low, jnp.where(jnp.isfinite(high), high - x, scale)]) / scale
 
 
-def _outside(
+def _length_in_box(
     box: Float[AnyArray, "2 3"],
     point: Float[AnyArray, "3"],
     position: Float[AnyArray, "3"],

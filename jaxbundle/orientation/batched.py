@@ -200,7 +200,7 @@ def prepare() -> None:
     intersect(rng.normal(size=(1, RAYS, 3)), rng.normal(size=(1, RAYS, 3)), np.ones((1, RAYS)))
 
 
-def spread(number: int, most: int = SLOTS) -> Int[np.ndarray, " rows"]:
+def evenly_spaced(number: int, most: int = SLOTS) -> Int[np.ndarray, " rows"]:
     """Up to `most` of a number of rows, evenly."""
     if number <= most:
         return np.arange(number)

@@ -62,7 +62,7 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
         return ""
     # The median of 2000 is known to 3 % of its spread (1.25/√n): more than enough to recognise a
     # factor of ten, of up to sixteen conventions.
-    rows = rows[batched.spread(len(rows), 2000)]
+    rows = rows[batched.evenly_spaced(len(rows), 2000)]
     some = network.replace(observations=rays.take(rows))
     centres, halves = (np.array(v) for v in zip(*(image_frame(c) for c in network.cameras)))
     camera = images.camera[some.observations.image]

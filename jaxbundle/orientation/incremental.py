@@ -241,7 +241,7 @@ def _refine(sights: Sights, model: Model, settings: StartValueSettings) -> None:
     # Of the rows that `many` uses: an image whose good points are not among these would be refined
     # by none.
     use = [
-        k for k, w in enumerate(weights) if w[batched.spread(len(w))].sum() >= settings.min_points
+        k for k, w in enumerate(weights) if w[batched.evenly_spaced(len(w))].sum() >= settings.min_points
     ]
     if not use:
         return
@@ -297,7 +297,7 @@ def intersect(
     while len(todo):
         intersected, angle, status = batched.intersect(X0[todo], rays[todo], weights[todo])
         misclosure = (
-            _across(intersected[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
+            _tangent_of_angle(intersected[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
         )
         sound = status == int(Status.SOUND)
         agree = sound & (misclosure.max(1) < 1)
@@ -311,7 +311,7 @@ def intersect(
     model.X[points_to_intersect] = np.where(good[:, None], X, np.nan)
 
 
-def _across(
+def _tangent_of_angle(
     d: Float[np.ndarray, "n rays 3"], rays: Float[np.ndarray, "n rays 3"]
 ) -> Float[np.ndarray, "n rays"]:
     """Tangent of the angle between a direction and a unit ray; 1000, above all tolerances but

@@ -87,7 +87,7 @@ def relative_orientation(
     points = stop_gradient((xy1, xy2, p))
     E = eight_points(*points)[0][None]
     if method == "five":
-        points = _after(E, points)
+        points = _wait_for(E, points)
         # With noise, a solution that is not quite real is a good start.
         E = jnp.concatenate([E, five_solutions(*points)[0]])
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
@@ -97,7 +97,7 @@ def relative_orientation(
     M, b = fit.estimate
     front = _in_front((M, b), xy1, xy2, p)
     vtpv = stop_gradient(fit.vtpv)
-    no_base, flat = _find_simpler(_after(vtpv, points), vtpv)
+    no_base, flat = _find_simpler(_wait_for(vtpv, points), vtpv)
     status = first_of(
         (no_base, Status.NO_BASE),
         (flat if method == "eight" else jnp.asarray(False), Status.COPLANAR_POINTS),
@@ -175,7 +175,7 @@ def _refine_best(
     return jax.tree.map(lambda a: a[k], refined), scores[k]
 
 
-def _after(waited_for: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
+def _wait_for(waited_for: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
     """The arrays, which wait for `waited_for`: adds zero. Decompositions that run side by side can
     hang jaxlib 0.10 on two cores; a barrier does not order them."""
     nothing = jnp.where(jnp.sum(waited_for) > 1e300, 1.0, 0.0)
@@ -197,11 +197,11 @@ def retract(pair: Motion, delta: Float[AnyArray, "5"]) -> Motion:
     """A pair (M, b) turned by δ[:3] in the frame of the second camera, its base moved by δ[3:]."""
     M, b = pair
     M = matrix_from_rotation_vector(delta[:3]) @ M
-    b = b + delta[3:] @ _across(b)
+    b = b + delta[3:] @ _perpendiculars(b)
     return M, b / jnp.linalg.norm(b)
 
 
-def _across(b: Float[AnyArray, "3"]) -> Float[Array, "2 3"]:
+def _perpendiculars(b: Float[AnyArray, "3"]) -> Float[Array, "2 3"]:
     """Two unit vectors perpendicular to b, of length 1, and to one another."""
     axis = jnp.eye(3, dtype=b.dtype)[jnp.argmin(jnp.abs(stop_gradient(b)))]
     axis_1 = jnp.cross(b, axis)
@@ -233,7 +233,7 @@ def _find_simpler(
     rays1, rays2 = (jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2))
     rotation = CameraPose(jnp.zeros(3), matrix_from_quaternion(rotation_between(rays1, rays2, p)))
     by_rotation = jax.vmap(image_of, (None, 0))(rotation, rays1)
-    H, _ = homography(*_after(by_rotation, (xy1, xy2, p)))
+    H, _ = homography(*_wait_for(by_rotation, (xy1, xy2, p)))
     by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)
 
     def variance_of(computed: Float[AnyArray, "n 2"], unknowns: int) -> Float[Array, ""]:

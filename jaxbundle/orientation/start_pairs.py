@@ -75,7 +75,7 @@ def _pairs_in_common(
     # one still has 0.33 of the points of the next (20 % of the format beside 60 %).
     sufficient = order[number[order] >= 0.3 * number.max(initial=0)]
     half_number = settings.max_pairs // 2
-    spread_rows = batched.spread(len(sufficient), settings.max_pairs - half_number)
+    spread_rows = batched.evenly_spaced(len(sufficient), settings.max_pairs - half_number)
     chosen_pairs = np.unique(np.concatenate([order[:half_number], sufficient[spread_rows]]))
     return pairs[chosen_pairs], number[chosen_pairs]
 

@@ -213,7 +213,7 @@ class OrientedBlock:
         usable = np.flatnonzero(np.isfinite(point.rays).all(1))
         best = np.zeros(len(point.rows), bool)
         closest = np.inf
-        rays_tried = usable[batched.spread(len(usable), self.settings.paired_rays)]
+        rays_tried = usable[batched.evenly_spaced(len(usable), self.settings.paired_rays)]
         for i in rays_tried:
             for j in rays_tried[rays_tried > i]:
                 pair = np.isin(np.arange(len(point.rows)), [i, j])

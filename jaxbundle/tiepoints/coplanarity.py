@@ -106,7 +106,7 @@ def estimate_interior(
     size = max(camera.image_size)
     limit = settings.misclosure * size / 3000
     clear = [
-        batched.spread(max(int(settings.distinct_share * len(a)), min_matches), SLOTS)
+        batched.evenly_spaced(max(int(settings.distinct_share * len(a)), min_matches), SLOTS)
         for a, _ in pairs
     ]
     xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))

@@ -187,7 +187,7 @@ def _find_agreeing(
     matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= settings.min_matches}
     # The most distinct ones, but all of a few.
-    distinct = lambda n: batched.spread(
+    distinct = lambda n: batched.evenly_spaced(
         max(int(settings.distinct_share * n), min(n, batched.SLOTS))
     )
     by_distinct = _orient_by_rows(rows, distinct, xy1, xy2, tolerance, settings)
@@ -334,7 +334,7 @@ def _improve(
         ]
         if len(good) >= min_matches:
             keys.append(k)
-            rows.append(good[batched.spread(len(good), MATCH_SLOTS)])
+            rows.append(good[batched.evenly_spaced(len(good), MATCH_SLOTS)])
     if not keys:
         return {}
     filled = lambda xy: np.stack([_fill(xy[k][r]) for k, r in zip(keys, rows)])
@@ -349,7 +349,7 @@ def refine_rotations(
     ideal: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]],
 ) -> Float[np.ndarray, "pairs 3 3"]:
     """M of pairs, refined with their matches at these coordinates, c = 1."""
-    rows = [batched.spread(len(pair), MATCH_SLOTS) for pair in pairs]
+    rows = [batched.evenly_spaced(len(pair), MATCH_SLOTS) for pair in pairs]
     weights = _used_slots(rows)
     xy1, xy2 = (np.stack([_fill(xy[i][r]) for xy, r in zip(ideal, rows)]) for i in (0, 1))
     # With a strong K1 rays of the border have no image: without weight.
@@ -410,7 +410,7 @@ def _classify(
 ) -> list[tuple[Bool[np.ndarray, " _"], float, str]]:
     """Matches, angle and kind of every pair."""
     rows = [
-        np.flatnonzero(good)[batched.spread(int(good.sum()), MATCH_SLOTS)] for good, *_ in agreed
+        np.flatnonzero(good)[batched.evenly_spaced(int(good.sum()), MATCH_SLOTS)] for good, *_ in agreed
     ]
     if not agreed:
         return []

@@ -202,11 +202,11 @@ def _turns(rotation: Float[Array, "4"]) -> Float[Array, "3 4"]:
     """∂q/∂(ω, φ, κ) of a unit quaternion, one row per angle: via a small rotation δθ, whose
     derivative of the angles is invertible."""
 
-    def both(d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
+    def angles_and_quaternion(d: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
         q = retract_quaternion(rotation, d)
         return omega_phi_kappa_near(matrix_from_quaternion(q), jnp.zeros(3)), q
 
-    of_angles, of_quaternion = jax.jacfwd(both)(jnp.zeros(3))
+    of_angles, of_quaternion = jax.jacfwd(angles_and_quaternion)(jnp.zeros(3))
     return (of_quaternion @ jnp.linalg.inv(of_angles)).T
 
 

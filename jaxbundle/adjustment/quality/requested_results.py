@@ -198,11 +198,11 @@ def effects_on(
     results: RequestedResults, values: Values, tangents: Values
 ) -> Float[np.ndarray, "k numbers"]:
     """The change of every requested number along tangents of the tables [k, rows, …]."""
-    return np.asarray(_along(results.function, values, tangents))
+    return np.asarray(_changes_along(results.function, values, tangents))
 
 
 @compile_once
-def _along(
+def _changes_along(
     function: Callable[[Values], Float[Array, " n"]], values: Values, tangents: Values
 ) -> Float[Array, "errors n"]:
     return jax.vmap(lambda d: jax.jvp(function, (values,), (d,))[1])(tangents)

@@ -366,12 +366,12 @@ class _State:
         scene, first = self.scene, self.first
         turn = rotation_vectors(other_scene.M @ scene.M.transpose(0, 2, 1))
         poses = np.concatenate([other_scene.X0 - scene.X0, turn], 1)
-        if self._outside(poses, first.image_cofactors):
+        if self._is_outside(poses, first.image_cofactors):
             return True
         located = self.free_points & ~self.problem.at_any_distance & ~self.problem.excluded
-        return self._outside((other_scene.X - scene.X)[located], first.point_cofactors[located])
+        return self._is_outside((other_scene.X - scene.X)[located], first.point_cofactors[located])
 
-    def _outside(self, change: Float[np.ndarray, "n k"], Q: Float[np.ndarray, "n k k"]) -> bool:
+    def _is_outside(self, change: Float[np.ndarray, "n k"], Q: Float[np.ndarray, "n k k"]) -> bool:
         # Of unit size, whatever the units of coordinates and angles.
         size = np.sqrt(np.maximum(np.diagonal(Q, axis1=1, axis2=2), 0))
         inverse = np.where(size > 0, 1 / np.where(size > 0, size, 1), 0)

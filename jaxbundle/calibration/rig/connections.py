@@ -97,7 +97,7 @@ class _Groups:
     def members(self, group: int) -> list[int]:
         return np.flatnonzero(self.of == group).tolist()
 
-    def all(self) -> list[list[int]]:
+    def groups(self) -> list[list[int]]:
         return [self.members(g) for g in dict.fromkeys(self.of.tolist())]
 
 
@@ -122,40 +122,40 @@ def connect(
     them; `NotSolvedError` if the motion of the rig, which alone could tie them, does not.
     """
     views, body = list(views), np.asarray(bodies)
-    rigs, walls, ties, open_motions = _Groups(len(cameras)), _Groups(len(boards)), [], []
+    camera_groups, board_groups, motion_ties, open_motions = _Groups(len(cameras)), _Groups(len(boards)), [], []
     while True:
-        poses = _poses(views, rigs, walls)
-        if _join_cameras(poses, views, rigs) or _join_boards(poses, walls, body):
+        poses = _poses(views, camera_groups, board_groups)
+        if _join_cameras(poses, views, camera_groups) or _join_boards(poses, board_groups, body):
             continue
-        motion_found, open_motions = _find_motion(poses, body, rigs, given_positions or {})
+        motion_found, open_motions = _find_motion(poses, body, camera_groups, given_positions or {})
         if motion_found is None:
             break
         (g1, h1), (g2, h2), motion, number = motion_found
         names_of = lambda names, rows: tuple(names[i] for i in rows)
-        ties.append(
+        motion_ties.append(
             MotionTie(
-                (names_of(cameras, rigs.members(g1)), names_of(cameras, rigs.members(g2))),
-                (names_of(boards, walls.members(h1)), names_of(boards, walls.members(h2))),
+                (names_of(cameras, camera_groups.members(g1)), names_of(cameras, camera_groups.members(g2))),
+                (names_of(boards, board_groups.members(h1)), names_of(boards, board_groups.members(h2))),
                 number,
                 motion.open.shape[1],
             )
         )
-        _merge_cameras(rigs, g1, g2, np.linalg.inv(motion.X))
-        _merge_boards(walls, h1, h2, np.linalg.inv(motion.Z))
-    if len(rigs.all()) > 1:
-        raise _separate_error(cameras, boards, body, views, rigs, open_motions)
-    groups = walls.all()
+        _merge_cameras(camera_groups, g1, g2, np.linalg.inv(motion.X))
+        _merge_boards(board_groups, h1, h2, np.linalg.inv(motion.Z))
+    if len(camera_groups.groups()) > 1:
+        raise _separate_error(cameras, boards, body, views, camera_groups, open_motions)
+    groups = board_groups.groups()
     separate = [
         tuple(boards[group[0]] for group in groups if body[group[0]] == first_board)
         for first_board in dict.fromkeys(body.tolist())
     ]
-    to_first_camera = np.linalg.inv(rigs.place[0])
-    references = [walls.members(int(group))[0] for group in walls.of]
+    to_first_camera = np.linalg.inv(camera_groups.place[0])
+    references = [board_groups.members(int(group))[0] for group in board_groups.of]
     return Connections(
-        [place @ to_first_camera for place in rigs.place],
+        [place @ to_first_camera for place in camera_groups.place],
         groups,
-        [np.linalg.inv(walls.place[r]) @ place for r, place in zip(references, walls.place)],
-        tuple(ties),
+        [np.linalg.inv(board_groups.place[r]) @ place for r, place in zip(references, board_groups.place)],
+        tuple(motion_ties),
         tuple(names for names in separate if len(names) > 1),
     )
 
@@ -167,21 +167,21 @@ def body_pose(view: BoardView, connections: Connections) -> Matrix:
     return rig @ np.linalg.inv(connections.places[view.board])
 
 
-def _poses(views: Iterable[BoardView], rigs: _Groups, walls: _Groups) -> Poses:
+def _poses(views: Iterable[BoardView], camera_groups: _Groups, board_groups: _Groups) -> Poses:
     """Of each pair of groups the pose at every epoch: by the view with most points."""
     best: dict[tuple[int, int, int], BoardView] = {}
     for view in views:
-        key = int(rigs.of[view.camera]), int(walls.of[view.board]), view.epoch
+        key = int(camera_groups.of[view.camera]), int(board_groups.of[view.board]), view.epoch
         if key not in best or view.points > best[key].points:
             best[key] = view
     poses: Poses = defaultdict(dict)
     for (g, h, epoch), view in best.items():
-        pose = np.linalg.inv(rigs.place[view.camera]) @ view.pose
-        poses[g, h][epoch] = pose @ np.linalg.inv(walls.place[view.board])
+        pose = np.linalg.inv(camera_groups.place[view.camera]) @ view.pose
+        poses[g, h][epoch] = pose @ np.linalg.inv(board_groups.place[view.board])
     return poses
 
 
-def _join_cameras(poses: Poses, views: Sequence[BoardView], rigs: _Groups) -> bool:
+def _join_cameras(poses: Poses, views: Sequence[BoardView], camera_groups: _Groups) -> bool:
     """Join the two groups of cameras that share most epochs; False if none share enough."""
     shared: dict[tuple[int, int], dict[int, Matrix]] = defaultdict(dict)
     for ((g1, h1), poses_a), ((g2, h2), poses_b) in combinations(sorted(poses.items()), 2):
@@ -190,7 +190,7 @@ def _join_cameras(poses: Poses, views: Sequence[BoardView], rigs: _Groups) -> bo
                 shared[g1, g2][e] = poses_b[e] @ np.linalg.inv(poses_a[e])
     epochs = defaultdict(set)
     for view in views:
-        epochs[int(rigs.of[view.camera])].add(view.epoch)
+        epochs[int(camera_groups.of[view.camera])].add(view.epoch)
     # A group with fewer epochs in all can share no more: then all of them suffice.
     sufficient = {
         pair: relations
@@ -200,11 +200,11 @@ def _join_cameras(poses: Poses, views: Sequence[BoardView], rigs: _Groups) -> bo
     if not sufficient:
         return False
     pair = max(sufficient, key=lambda pair: len(sufficient[pair]))
-    _merge_cameras(rigs, *pair, medoid([*sufficient[pair].values()]))
+    _merge_cameras(camera_groups, *pair, medoid([*sufficient[pair].values()]))
     return True
 
 
-def _join_boards(poses: Poses, walls: _Groups, body: np.ndarray) -> bool:
+def _join_boards(poses: Poses, board_groups: _Groups, body: np.ndarray) -> bool:
     """Join the two groups of boards of one body that are seen together at most epochs."""
     shared: dict[tuple[int, int], dict[int, Matrix]] = defaultdict(dict)
     for ((g1, h1), poses_a), ((g2, h2), poses_b) in combinations(sorted(poses.items()), 2):
@@ -214,20 +214,20 @@ def _join_boards(poses: Poses, walls: _Groups, body: np.ndarray) -> bool:
     if not shared:
         return False
     pair = max(shared, key=lambda pair: len(shared[pair]))
-    _merge_boards(walls, *pair, medoid([*shared[pair].values()]))
+    _merge_boards(board_groups, *pair, medoid([*shared[pair].values()]))
     return True
 
 
-def _merge_cameras(rigs: _Groups, group: int, joined_group: int, change: Matrix) -> None:
+def _merge_cameras(camera_groups: _Groups, group: int, joined_group: int, change: Matrix) -> None:
     """Give the cameras of a group the frame of another; `change`: from that to theirs."""
-    for k in rigs.members(joined_group):
-        rigs.place[k], rigs.of[k] = rigs.place[k] @ change, group
+    for k in camera_groups.members(joined_group):
+        camera_groups.place[k], camera_groups.of[k] = camera_groups.place[k] @ change, group
 
 
-def _merge_boards(walls: _Groups, group: int, joined_group: int, change: Matrix) -> None:
+def _merge_boards(board_groups: _Groups, group: int, joined_group: int, change: Matrix) -> None:
     """Give the boards of a group the frame of another; `change`: from theirs to that."""
-    for j in walls.members(joined_group):
-        walls.place[j], walls.of[j] = change @ walls.place[j], group
+    for j in board_groups.members(joined_group):
+        board_groups.place[j], board_groups.of[j] = change @ board_groups.place[j], group
 
 
 class _OpenMotion(NamedTuple):
@@ -243,7 +243,7 @@ class _OpenMotion(NamedTuple):
 def _find_motion(
     poses: Poses,
     body: np.ndarray,
-    rigs: _Groups,
+    camera_groups: _Groups,
     given_positions: Mapping[int, Float[np.ndarray, "3"]],
 ) -> tuple[tuple | None, list[_OpenMotion]]:
     """The motion over most epochs that ties two groups of cameras, alone or with a given position,
@@ -264,12 +264,12 @@ def _find_motion(
             )
             cameras_given = [
                 k
-                for k in rigs.members(pair_b[0])
-                if k in given_positions and rigs.of[0] == pair_a[0]
+                for k in camera_groups.members(pair_b[0])
+                if k in given_positions and camera_groups.of[0] == pair_a[0]
             ]
             if cameras_given and not motion.determined:
                 motion = _shift_to(
-                    motion, rigs, cameras_given[0], given_positions[cameras_given[0]]
+                    motion, camera_groups, cameras_given[0], given_positions[cameras_given[0]]
                 )
             if cameras_given or motion.determined:
                 return (pair_a, pair_b, motion, len(epochs)), open_motions
@@ -278,12 +278,12 @@ def _find_motion(
 
 
 def _shift_to(
-    motion: Motion, rigs: _Groups, camera: int, position: Float[np.ndarray, "3"]
+    motion: Motion, camera_groups: _Groups, camera: int, position: Float[np.ndarray, "3"]
 ) -> Motion:
     """A motion with its open part such that a camera is at a position in the frame of the first."""
-    place = np.linalg.inv(rigs.place[camera])  # its centre in the frame of its group
-    present_position = rigs.place[0] @ motion.X @ place[:, 3]
-    return motion.shifted(rigs.place[0][:3, :3].T @ (position - present_position[:3]))
+    place = np.linalg.inv(camera_groups.place[camera])  # its centre in the frame of its group
+    present_position = camera_groups.place[0] @ motion.X @ place[:, 3]
+    return motion.shifted(camera_groups.place[0][:3, :3].T @ (position - present_position[:3]))
 
 
 def _separate_error(
@@ -291,11 +291,11 @@ def _separate_error(
     boards: Sequence[str],
     body: np.ndarray,
     views: Sequence[BoardView],
-    rigs: _Groups,
+    camera_groups: _Groups,
     open_motions: Sequence[_OpenMotion],
 ) -> InputError | NotSolvedError:
     """Which cameras hang together, and what would join them."""
-    groups = rigs.all()
+    groups = camera_groups.groups()
     boards_seen = [{v.board for v in views if v.camera in group} for group in groups]
     names_of_groups = [list_some([cameras[k] for k in group], 6) for group in groups]
     parts = "; ".join(
@@ -303,13 +303,13 @@ def _separate_error(
         for names, group, boards_of_group in zip(names_of_groups, groups, boards_seen)
     )
     message = f"the cameras are in {len(groups)} groups that nothing ties together: {parts}"
-    number = {int(rigs.of[group[0]]): i for i, group in enumerate(groups)}
+    number = {int(camera_groups.of[group[0]]): i for i, group in enumerate(groups)}
     for open_motion in open_motions:
         if open_motion.motion is not None:
             names_a, names_b = (
                 names_of_groups[number[pair[0]]] for pair in (open_motion.one, open_motion.other)
             )
-            reference = cameras[rigs.members(open_motion.one[0])[0]]
+            reference = cameras[camera_groups.members(open_motion.one[0])[0]]
             why = _why_open(open_motion.motion, open_motion.epochs, names_a, names_b, reference)
             return NotSolvedError(f"not solved: {message}. {why}")
     group_a, group_b = _nearest(groups, boards_seen)

@@ -82,7 +82,7 @@ def _images(
     by (δb, δθ), the pose and the parameters; and the coordinates along the lines of sight."""
     space = Pose()
 
-    def one(pose: PoseValue, X: Array) -> tuple[Array, Array, Array]:
+    def image_of_point(pose: PoseValue, X: Array) -> tuple[Array, Array, Array]:
         prepared_pose, mounted = space.prepare(pose), space.prepare(mounting)
 
         def image(change: Array, p: Array) -> Array:
@@ -98,7 +98,7 @@ def _images(
             jnp.asarray(mounted.ray(prepared_pose.ray(tuple(X)))[2]),
         )
 
-    return jax.vmap(lambda pose: jax.vmap(lambda X: one(pose, X))(points))(poses)
+    return jax.vmap(lambda pose: jax.vmap(lambda X: image_of_point(pose, X))(points))(poses)
 
 
 def next_view(

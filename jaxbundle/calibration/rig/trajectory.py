@@ -128,7 +128,7 @@ class TargetMotion:
 
 @partial(compile_once, static=())
 def _view_poses(controls: PoseValue, u: Float[AnyArray, " n"]) -> PoseValue:
-    def one(four: PoseValue, u: Scalar) -> PoseValue:
+    def view_pose(four: PoseValue, u: Scalar) -> PoseValue:
         posed = [Pose().prepare(jax.tree.map(lambda x, k=k: x[k], four)) for k in range(CONTROLS)]
         place = lambda X: jnp.stack(place_on_spline(posed, u, X))
         # By the function of the observations: a second formula could disagree with it.
@@ -137,7 +137,7 @@ def _view_poses(controls: PoseValue, u: Float[AnyArray, " n"]) -> PoseValue:
         M = jnp.stack([place(axis) - t for axis in axes], 1)
         return PoseValue(-M.T @ t, quaternion_from_matrix(M))
 
-    return jax.vmap(one)(controls, u)
+    return jax.vmap(view_pose)(controls, u)
 
 
 def plan_runs(

@@ -118,8 +118,8 @@ def make_page(
         settings,
         tables,
         {**drawings, "explore": state},
-        tuple(_read(name) for name in SCRIPTS),
-        _read(STYLE),
+        tuple(_read_resource(name) for name in SCRIPTS),
+        _read_resource(STYLE),
         live,
     )
 
@@ -129,5 +129,5 @@ def place(id: str) -> str:
     return f'<div id="{id}" aria-live="polite"></div>\n'
 
 
-def _read(name: str) -> str:
+def _read_resource(name: str) -> str:
     return files("jaxbundle.explorer.page").joinpath(name).read_text(encoding="utf-8")

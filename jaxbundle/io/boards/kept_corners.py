@@ -73,7 +73,7 @@ class KeptCorners:
         # A name of bytes that are not UTF-8 has no text that SQLite would take.
         path = os.fsencode(os.path.abspath(photograph)).decode(errors="backslashreplace")
         size_and_time = state.st_size, state.st_mtime_ns
-        stored_row = self._first(
+        stored_row = self._first_row(
             "SELECT size, changed, content FROM photographs WHERE path = ?", path
         )
         # Reading thousands of photographs again would take minutes.
@@ -91,7 +91,7 @@ class KeptCorners:
 
     def look(self, content: str, board: Board) -> Look | None:
         """The search result of a board in a photograph of this content; None: not searched."""
-        result = self._first(
+        result = self._first_row(
             "SELECT columns, rows, xy, why FROM boards WHERE content = ? AND board = ?",
             content,
             _key(board),
@@ -125,7 +125,7 @@ class KeptCorners:
             why,
         )
 
-    def _first(self, question: str, *values: SqlValue) -> tuple | None:
+    def _first_row(self, question: str, *values: SqlValue) -> tuple | None:
         try:
             return self._file.execute(question, values).fetchone()
         except SQLITE_ERRORS as error:

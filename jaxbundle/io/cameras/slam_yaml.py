@@ -55,11 +55,11 @@ class Lens:
         return {**self.required, **self.optional}
 
 
-def _under(section: str, **keys: str) -> dict[str, str]:
+def _keys_in_section(section: str, **keys: str) -> dict[str, str]:
     return {name: f"{section}.{key}" for name, key in keys.items()}
 
 
-def _same(section: str, names: str) -> dict[str, str]:
+def _same_names(section: str, names: str) -> dict[str, str]:
     return {name: f"{section}.{name}" for name in names.split()}
 
 
@@ -70,22 +70,22 @@ PROJECTION, DISTORTION, MIRROR = (
 )
 CAMODOCAL = {
     "PINHOLE": Lens(
-        "opencv", _same(PROJECTION, "fx fy cx cy"), _same(DISTORTION, "k1 k2 p1 p2 k3")
+        "opencv", _same_names(PROJECTION, "fx fy cx cy"), _same_names(DISTORTION, "k1 k2 p1 p2 k3")
     ),
     "PINHOLE_FULL": Lens(
-        "opencv", _same(PROJECTION, "fx fy cx cy"), _same(DISTORTION, "k1 k2 p1 p2 k3 k4 k5 k6")
+        "opencv", _same_names(PROJECTION, "fx fy cx cy"), _same_names(DISTORTION, "k1 k2 p1 p2 k3 k4 k5 k6")
     ),
     "KANNALA_BRANDT": Lens(
         "kannala-brandt",
-        _under(PROJECTION, fx="mu", fy="mv", cx="u0", cy="v0", k1="k2", k2="k3", k3="k4", k4="k5"),
+        _keys_in_section(PROJECTION, fx="mu", fy="mv", cx="u0", cy="v0", k1="k2", k2="k3", k3="k4", k4="k5"),
     ),
     "MEI": Lens(
         "mei",
         {
-            **_under(MIRROR, xi="xi"),
-            **_under(PROJECTION, fx="gamma1", fy="gamma2", cx="u0", cy="v0"),
+            **_keys_in_section(MIRROR, xi="xi"),
+            **_keys_in_section(PROJECTION, fx="gamma1", fy="gamma2", cx="u0", cy="v0"),
         },
-        _same(DISTORTION, "k1 k2 p1 p2"),
+        _same_names(DISTORTION, "k1 k2 p1 p2"),
     ),
 }
 SCARAMUZZA = "SCARAMUZZA"

@@ -92,7 +92,7 @@ class Resources(NamedTuple):
                 f"{self.path}: {len(files_of_kind)} resources of format {kind}, "
                 f"{list_some(files_of_kind, as_text=str)}; expected a project with one calibration"
             )
-        return _read(files_of_kind[0], kind, self.unknown) if files_of_kind else None
+        return _read_file(files_of_kind[0], kind, self.unknown) if files_of_kind else None
 
 
 def is_opf(path: Path) -> bool:
@@ -157,14 +157,14 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 # --- files ----------------------------------------------------------------------------------
 
 
-def _read(path: Path, kind: str, unknown: UnknownKeys) -> JsonFields:
+def _read_file(path: Path, kind: str, unknown: UnknownKeys) -> JsonFields:
     document = read_object(path, read_text(path), "OPF")
     unknown.check_objects(document, KEYS[kind], path)
     return JsonFields(path, document)
 
 
 def _resources(path: Path, unknown: UnknownKeys) -> Resources:
-    file = _read(path, PROJECT, unknown)
+    file = _read_file(path, PROJECT, unknown)
     files: dict[str, list[Path]] = {}
     tracks: list[Path] = []
     for item in file.rows("items"):
@@ -361,7 +361,7 @@ def _tracks(
     rays: dict[str, Any] = {"image": [], "point": [], "x": [], "y": []}
     if (path := resources.tracks) is None:
         return points, rays
-    file = _read(path, TRACKS, resources.unknown)
+    file = _read_file(path, TRACKS, resources.unknown)
     colours = []
     for node in file.rows("nodes"):
         if node.get("children") and node.get("matrix") is not None:
@@ -369,7 +369,7 @@ def _tracks(
         if node.get("mesh") is None:
             continue
         # The specification has one primitive a mesh.
-        primitive = _of(_of(file, "meshes", node.integer("mesh")), "primitives", 0)
+        primitive = _row_of(_row_of(file, "meshes", node.integer("mesh")), "primitives", 0)
         if primitive.get("extensions") is None or MATCHES not in primitive.get("extensions"):
             continue
         matches = primitive.child("extensions").child(MATCHES)
@@ -444,7 +444,7 @@ def _ranges(file: JsonFields, matches: JsonFields, n: int) -> tuple[np.ndarray, 
     return first_match.astype(np.int64), (packed >> np.uint64(40)).astype(np.int64)
 
 
-def _of(file: JsonFields, key: str, index: int) -> JsonFields:
+def _row_of(file: JsonFields, key: str, index: int) -> JsonFields:
     rows = file.rows(key)
     if index >= len(rows):
         raise InputError(f"{file.path}: {key}[{index}] is missing")
@@ -453,15 +453,15 @@ def _of(file: JsonFields, key: str, index: int) -> JsonFields:
 
 def _accessor(file: JsonFields, index: int, kind: str | None) -> np.ndarray:
     """The numbers of an accessor, a row an element."""
-    accessor = _of(file, "accessors", index)
+    accessor = _row_of(file, "accessors", index)
     component, form = accessor.integer("componentType"), accessor.text("type")
     if component not in COMPONENTS or form not in LENGTHS or kind not in (None, form):
         raise InputError(
             f"{accessor.path}: numbers of type {component}, {form}, where {kind or 'VEC4'} is "
             "expected"
         )
-    view = _of(file, "bufferViews", accessor.integer("bufferView"))
-    buffer = _of(file, "buffers", view.integer("buffer"))
+    view = _row_of(file, "bufferViews", accessor.integer("bufferView"))
+    buffer = _row_of(file, "buffers", view.integer("buffer"))
     dtype = np.dtype(COMPONENTS[component])
     width = dtype.itemsize * LENGTHS[form]
     if accessor.get("sparse") is not None or view.integer("byteStride", width) != width:

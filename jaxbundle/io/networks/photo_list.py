@@ -131,7 +131,7 @@ class _Parser:
         photos, image_points, object_points = [], [], []
         counted = "line 1 gives the focal length"
         # 7 words are an object point, 13 or more a photograph, whose name may have blanks
-        while self._more() and len(self.lines[self.next][1]) != 7:
+        while self._has_more() and len(self.lines[self.next][1]) != 7:
             number, words = self.lines[self.next]
             if len(words) < 13:
                 raise self._error(
@@ -147,7 +147,7 @@ class _Parser:
             photos.append(photo)
         if not photos:
             raise self._error(self.lines[-1][0], "no photograph after the focal length")
-        while self._more():
+        while self._has_more():
             number, words = self.lines[self.next]
             if len(words) != 7:
                 raise self._error(
@@ -172,7 +172,7 @@ class _Parser:
         return self._number(number, "the focal length", words[0])
 
     def _count(self, photo: _Row) -> tuple[int, int]:
-        if not self._more():
+        if not self._has_more():
             raise self._error(photo.line, f"the file ends after {photo}")
         number, words = self.lines[self.next]
         # Nine digits: int() of a longer text is no count, and may take minutes.
@@ -185,7 +185,7 @@ class _Parser:
         return number, int(words[0])
 
     def _image_point(self, photo: _Row, counted: str, number_done: int) -> _Row:
-        if not self._more():
+        if not self._has_more():
             raise self._error(
                 self.lines[-1][0],
                 f"the file ends after {count(number_done, 'image point')}; {counted}",
@@ -220,7 +220,7 @@ class _Parser:
             raise self._error(line, f"{noun} is {word!r}; expected a number")
         return number
 
-    def _more(self) -> bool:
+    def _has_more(self) -> bool:
         return self.next < len(self.lines)
 
     def _error(self, line: int, message: str) -> InputError:

@@ -238,7 +238,7 @@ class _SourcePixels:
         max_pixels, reach = 2**22 / self.bands.count, REACH[self._kind]
         has_values = False
         for part, window in _parts(line, pixel, image, max_pixels, reach):
-            pixels = self._read(window)
+            pixels = self._read_window(window)
             (top, _), (left, _) = window
             values, any_ = _resample(
                 self._kind,
@@ -253,7 +253,7 @@ class _SourcePixels:
             has_values |= bool(any_)
         return np.moveaxis(values_found, -1, 0) if has_values else None
 
-    def _read(self, window: Window) -> np.ndarray:
+    def _read_window(self, window: Window) -> np.ndarray:
         """The pixels [rows, columns, bands] of a window, NaN where they are masked.
 
         Widened to a multiple of 128, or of an eighth of the size: the compiled program is one for

@@ -98,8 +98,8 @@ def write_csm_state(
         times_between = begin + (end - begin) * (np.arange(intervals) + 0.5) / intervals
         truth = _poses(source, times_between)
         # Of the middles of intervals, in which the error is largest.
-        P_found = _between(t, P - P[0], times_between) + P[0]
-        R_found = Rotation.from_quat(_between(t, R.as_quat(), times_between))
+        P_found = _interpolate_middles(t, P - P[0], times_between) + P[0]
+        R_found = Rotation.from_quat(_interpolate_middles(t, R.as_quat(), times_between))
         wrong = np.linalg.norm(P_found - truth[0], axis=1).max()
         wrong += distance * (R_found.inv() * Rotation.from_matrix(truth[1])).magnitude().max()
         wrong += len(t) * np.finfo(float).eps / 2 * np.linalg.norm(P[0])
@@ -153,7 +153,7 @@ def _tables(
     return t, P, Rotation.from_quat(q)
 
 
-def _between(
+def _interpolate_middles(
     t: Float[np.ndarray, " rows"],
     values: Float[np.ndarray, "rows k"],
     times: Float[np.ndarray, "n"],
@@ -234,7 +234,7 @@ def _rays(
     """P, R, and unit vectors [n, k, 3] to the points of pixels at the height, Earth-fixed."""
     surface = Height(level=height, earth=earth)
 
-    def at(t: Scalar) -> tuple[Array, Array, Array]:
+    def ray_at(t: Scalar) -> tuple[Array, Array, Array]:
         pose = pose_at(image, t)
 
         def direction(u: Scalar) -> Array:
@@ -244,7 +244,7 @@ def _rays(
 
         return jnp.asarray(pose.P), jnp.asarray(pose.R), jax.vmap(direction)(pixels * 1.0)
 
-    return jax.lax.map(at, times, batch_size=64)
+    return jax.lax.map(ray_at, times, batch_size=64)
 
 
 def _sights(

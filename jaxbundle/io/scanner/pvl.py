@@ -36,11 +36,11 @@ def read_support_data(path: Path) -> ET.Element:
             raise InputError(
                 f"{path}: {path.stem}.{name} is not next to it; {', '.join(GROUPS)} belong together"
             )
-        _read(file, ET.SubElement(root, name))
+        _read_into(file, ET.SubElement(root, name))
     return root
 
 
-def _read(path: Path, root: ET.Element) -> None:
+def _read_into(path: Path, root: ET.Element) -> None:
     """Add the groups and values of a file to an element."""
     text, begin, groups = without_comments(read_text(path, fallback="latin-1")), 0, [root]
     wrong = lambda what: InputError(f"{path}, line {text[:begin].count(chr(10)) + 1}: {what}")

@@ -163,7 +163,7 @@ def _loader() -> Any:
             node = self.get_node() if self.check_node() else None
             return None if node is None else self.construct_document(node)
 
-    def whole(_loader: Any, node: Any) -> int:
+    def whole_number(_loader: Any, node: Any) -> int:
         digits = node.value.lstrip("+-0")
         if len(digits) > len(str(LARGEST_INTEGER)):
             raise yaml.MarkedYAMLError(problem=TOO_LARGE, problem_mark=node.start_mark)
@@ -184,7 +184,7 @@ def _loader() -> Any:
     for tag, form, first_characters in CORE_SCHEMA:
         tag = f"tag:yaml.org,2002:{tag}"
         Loader.add_implicit_resolver(tag, re.compile(f"(?:{form})$"), list(first_characters))
-    Loader.add_constructor("tag:yaml.org,2002:int", whole)
+    Loader.add_constructor("tag:yaml.org,2002:int", whole_number)
     Loader.add_constructor("tag:yaml.org,2002:float", real)
     for prefix in ("tag:yaml.org,2002:", "!", ""):
         Loader.add_multi_constructor(prefix, content)

@@ -58,7 +58,7 @@ def _acquire(lock: Path, shown_name: str | Path, needed: bool) -> BinaryIO:
 
     **Raises:** `InputError` as `hold_lock`."""
     try:
-        while (stream := _open(lock, needed)) is None:
+        while (stream := _open_locked(lock, needed)) is None:
             pass
     except BlockingIOError:
         raise InputError(
@@ -72,7 +72,7 @@ def _acquire(lock: Path, shown_name: str | Path, needed: bool) -> BinaryIO:
     return stream
 
 
-def _open(lock: Path, needed: bool) -> BinaryIO | None:
+def _open_locked(lock: Path, needed: bool) -> BinaryIO | None:
     """The file, locked; None if it vanished meanwhile.
 
     **Raises:** `BlockingIOError` if another process has the lock."""

@@ -357,7 +357,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     start = turn_start(declared, plan, values, start)
     no_motion, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
 
-    def along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:
+    def move_along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:
         datum = not_none(keep_held_fixed(declared, plan, of).datum)
         return _move(declared, plan, datum.gauge @ tau, values)
 
@@ -366,13 +366,13 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     slope = jax.jacfwd(_datum_misclosure)(no_motion, fixed, constants)
     # `values` are in the datum to 1e-12 already: one Newton step of rounding size, but with it the
     # root below is exactly zero, where its equation is differentiated.
-    values = along(
+    values = move_along(
         -jnp.linalg.solve(slope, _datum_misclosure(no_motion, fixed, constants)),
         constants[0],
         values,
     )
     tau = implicit_root(_datum_misclosure, solve_dense, no_motion, fixed, (values, start))
-    return along(tau, values, values)
+    return move_along(tau, values, values)
 
 
 def _move(

@@ -96,10 +96,10 @@ def scalars(rows: PyTree[Float[Array, "n ..."]]) -> PyTree[Float[Array, " n"]]:
     """The elements of every row: numbers as they are, vectors as tuples, matrices as tuples of
     tuples."""
 
-    def split(x: Float[Array, "n ..."]) -> Any:
-        return x if x.ndim == 1 else Elements(split(x[:, i]) for i in range(x.shape[1]))
+    def split_elements(x: Float[Array, "n ..."]) -> Any:
+        return x if x.ndim == 1 else Elements(split_elements(x[:, i]) for i in range(x.shape[1]))
 
-    return jax.tree.map(split, rows)
+    return jax.tree.map(split_elements, rows)
 
 
 def prepare(declared: Declared, values: Values) -> Prepared:

@@ -27,7 +27,7 @@ class Rigid(NamedTuple):
     R: Float[np.ndarray, "*n 3 3"]
     t: Float[np.ndarray, "*n 3"]
 
-    def of(self, inner: "Rigid") -> "Rigid":
+    def after(self, inner: "Rigid") -> "Rigid":
         """This one after the other."""
         return Rigid(self.R @ inner.R, (self.R @ inner.t[..., None])[..., 0] + self.t)
 
@@ -55,7 +55,7 @@ def motions(A: Rigid, B: Rigid) -> tuple[Rigid, Rigid]:
     pairs = [np.arange(n - step) for step in steps]
     i = np.concatenate([begin + step for begin, step in zip(pairs, steps)])
     j = np.concatenate(pairs)
-    motions_of = lambda T: Rigid(T.R[j], T.t[j]).inverse.of(Rigid(T.R[i], T.t[i]))
+    motions_of = lambda T: Rigid(T.R[j], T.t[j]).inverse.after(Rigid(T.R[i], T.t[i]))
     return motions_of(A), motions_of(B)
 
 
@@ -99,10 +99,10 @@ def solve(A: Rigid, B: Rigid) -> tuple[Rigid, Rigid, float]:
 
 def other_side(A: Rigid, X: Rigid, B: Rigid) -> Rigid:
     """Y of A·X = Y·B, the mean over all poses."""
-    Y = A.of(X).of(B.inverse)
+    Y = A.after(X).after(B.inverse)
     R = nearest_rotation(Y.R.sum(0))
     # Of the places of B, not of its far origin.
-    t = (A.of(X).t - B.t @ R.T).mean(0)
+    t = (A.after(X).t - B.t @ R.T).mean(0)
     return Rigid(R, t)
 
 

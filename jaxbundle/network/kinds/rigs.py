@@ -343,7 +343,7 @@ def _mountings(
         base = mounting_of[known_camera]
         assert base is not None
         for c in cameras:
-            if mounting_of[c] is None and (step := _between(epochs, known_camera, c, position, M)):
+            if mounting_of[c] is None and (step := _mounting_between(epochs, known_camera, c, position, M)):
                 # x_c = R·(M_known·(X − X_known) − t), and M_known = R_known·M_reference
                 place = base.position + base.rotation.T @ step.position
                 mounting_of[c] = MountedPose(place, step.rotation @ base.rotation)
@@ -351,7 +351,7 @@ def _mountings(
     return mounting_of
 
 
-def _between(
+def _mounting_between(
     epochs: Sequence[Mapping[int, int]],
     camera_a: int,
     camera_b: int,
