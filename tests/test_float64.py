@@ -144,11 +144,11 @@ def test_the_compiler_is_given_only_flags_that_it_knows(monkeypatch):
     run_without_settings("import jax, jaxbundle; jaxbundle.enable_x64(compile_quickly=True); "
                          "assert float(jax.jit(abs)(-1.0)) == 1.0", 120)  # fmt: skip
     flags = [xla_flags.QUICK_LOOPS, LITTLE_OPTIMISATION, "--xla_unheard_of=1"]
-    here = xla_flags._known(flags[:2])
+    here = xla_flags._known_flags(flags[:2])
     monkeypatch.setattr(xla_flags, "jaxlib_version", lambda: (99, 0, 0))
-    assert xla_flags._known(flags) == here and LITTLE_OPTIMISATION in here
+    assert xla_flags._known_flags(flags) == here and LITTLE_OPTIMISATION in here
     monkeypatch.setattr(sys, "executable", "/nowhere")
-    assert xla_flags._known(flags) == []
+    assert xla_flags._known_flags(flags) == []
 
 
 def test_small_inputs_are_compiled_quickly(tmp_path, monkeypatch):

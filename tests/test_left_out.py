@@ -11,7 +11,7 @@ from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.orientation.collinear import rays_coincide, see_collinear_points
 from jaxbundle.orientation.incremental import Model
-from jaxbundle.orientation.rays import Sights, in_plane, sights
+from jaxbundle.orientation.rays import Sights, in_plane, make_sights
 from jaxbundle.planning.stations import Stations
 from jaxbundle.report.page.adjustment import compose
 
@@ -241,7 +241,7 @@ def good_start():
 def test_image_points_beyond_the_side_of_a_fisheye_give_start_values(good_start):
     """From 81° on they had no start values, and their points were seen in 0 placed images."""
     given = fisheye((0.01, 0.001))
-    away = np.degrees(np.arccos(-sights(given).ray[:, 2]))
+    away = np.degrees(np.arccos(-make_sights(given).ray[:, 2]))
     assert (away > 81).mean() > 0.1 and away.max() > 92
     assert good_start.converged and not good_start.problem.network.left_out
     assert good_start.counts.observations == 2 * len(given.observations)

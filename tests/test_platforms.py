@@ -186,13 +186,13 @@ def test_memory_of_windows_and_of_macos(monkeypatch):
         patch.setattr(sys, "platform", "win32")
         patch.setattr(memory.ctypes, "windll", SimpleNamespace(kernel32=kernel), raising=False)
         patch.setattr(memory.ctypes, "byref", ctypes.pointer)
-        patch.setattr(memory, "_read", lambda _: "")
+        patch.setattr(memory, "_read_text", lambda _: "")
         patch.setitem(sys.modules, "resource", None)
         assert memory.free_memory() == 5 * 2**30
         kernel.GlobalMemoryStatusEx = lambda _: 0
         assert memory.free_memory() == float("inf")
     with monkeypatch.context() as patch:  # macOS: no /proc, pages of the whole machine
-        patch.setattr(memory, "_read", lambda _: "")
+        patch.setattr(memory, "_read_text", lambda _: "")
         pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         assert memory.free_memory() == pages / 2
 

@@ -41,7 +41,7 @@ from jaxbundle.orientation.incremental import (
     place_far_points,
 )
 from jaxbundle.orientation.missing import explain_missing, note_missing
-from jaxbundle.orientation.rays import Sights, sights
+from jaxbundle.orientation.rays import Sights, make_sights
 from jaxbundle.types import AnyArray
 
 # Limits for what is readmitted. Start values may miss by 3 tolerances (image points) or 4 (rays of
@@ -97,7 +97,9 @@ def find_collinear(
     narrow, flat = _find_candidates(problem, values, factor)
     if not (narrow.any() or flat.any()):
         return CollinearGeometry()
-    sighted = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
+    sighted = make_sights(
+        network.replace(cameras=tuple(adjusted_cameras(problem, values).values()))
+    )
     model = _adjusted_model(problem, values, network, sighted)
     points, one_place = rays_coincide(sighted, model, narrow, factor or 1.0)
     images = flat & see_collinear_points(sighted, model, factor or 1.0)
@@ -316,7 +318,7 @@ def _place_left_out(
     cameras_as_adjusted = tuple(
         cameras.get(camera.id, camera) for camera in network_as_given.cameras
     )
-    sighted = sights(network_as_given.replace(cameras=cameras_as_adjusted))
+    sighted = make_sights(network_as_given.replace(cameras=cameras_as_adjusted))
     model = _adjusted_model(problem, values, network_as_given, sighted)
     model.control = are_held(network_as_given.points)
     new = model.control & ~model.known

@@ -27,7 +27,7 @@ from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.batched import matrices_of_quaternions
-from jaxbundle.orientation.rays import sights
+from jaxbundle.orientation.rays import make_sights
 from jaxbundle.types import not_none
 
 
@@ -223,7 +223,9 @@ def _in_front(
     infinity."""
     network = problem.network
     position, rotation = map(np.asarray, values["image"])
-    sighted = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
+    sighted = make_sights(
+        network.replace(cameras=tuple(adjusted_cameras(problem, values).values()))
+    )
     M = matrices_of_quaternions(rotation)[sighted.image]
     ray = np.einsum("nij,ni->nj", M, sighted.ray)
     depth = (ray * (X[sighted.point] - position[sighted.image])).sum(1)

@@ -38,7 +38,7 @@ from jaxbundle.leastsquares.problem import with_data, with_factor
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.kinds.figures import KNOWN_SHAPES, across_rays
+from jaxbundle.network.kinds.figures import KNOWN_SHAPES, sigma_across_rays
 from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, Observations, Points
 from jaxbundle.network.unit_mistakes import (
@@ -245,7 +245,9 @@ class FirstMinimum:
         if KNOWN_SHAPES not in weights:
             return start
         stiff = np.asarray(weights[KNOWN_SHAPES])
-        soft = np.minimum(stiff, 1 / (self.settings.soft_sigma * across_rays(problem.network)))
+        soft = np.minimum(
+            stiff, 1 / (self.settings.soft_sigma * sigma_across_rays(problem.network))
+        )
         if not (soft < stiff).any():
             return start
         data = dataclasses.replace(problem.data, weight={**weights, KNOWN_SHAPES: soft})

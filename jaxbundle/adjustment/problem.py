@@ -23,7 +23,7 @@ from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.network.camera_tables import CameraTable
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import DeclaredNetwork, declare, order_cameras
-from jaxbundle.network.kinds.base import present_kinds
+from jaxbundle.network.kinds.base import included_tables
 from jaxbundle.network.kinds.image_points import image_coordinates
 from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.subsets import split_check_points
@@ -341,7 +341,7 @@ def _datum(
         )
     # With the scale open, all distances shrink to fit a σ that is a length (1 mm from a plane): the
     # minimum would be a network of size 0.
-    needing_scale = [kind for kind in present_kinds(network) if kind.needs_scale]
+    needing_scale = [kind for kind in included_tables(network) if kind.needs_scale]
     if needing_scale and is_scale_open(gauge, network.points.position - origin):
         raise InputError(
             f"{needing_scale[0].source.name}: a σ of {needing_scale[0].TABLE} is a length, but "

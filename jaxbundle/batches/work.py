@@ -160,7 +160,12 @@ class BatchSettings:
     def of_cameras(self) -> dict:
         """Settings of the lines of cameras and rigs."""
         settings = {"model": self.named, "free": list(free_parameters(self.model, self.free))}
-        settings |= {**self.adjusting, **self._correlated_setting, "brief": self.brief, **self.sections()}
+        settings |= {
+            **self.adjusting,
+            **self._correlated_setting,
+            "brief": self.brief,
+            **self.sections(),
+        }
         return settings | ({} if self.pixel_size is None else {"pixel_size": self.pixel_size})
 
     def of_networks(self) -> dict:

@@ -48,7 +48,9 @@ def turning_radius(
         # Up to 200 times the half diagonal, dense near it: a barrel distortion brings far points
         # into the image.
         radii = radius_max * t / (1.005 - t)
-    determinant, measured = map(np.asarray, _determinant_along(model, p, azimuth[:, None], radii[None, :]))
+    determinant, measured = map(
+        np.asarray, _determinant_along(model, p, azimuth[:, None], radii[None, :])
+    )
     # NaN, beyond the range of a formula, counts as turned.
     turned = ~(determinant > 0)
     first_turn = (turned | (measured > radius_max)).argmax(1)

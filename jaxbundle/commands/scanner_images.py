@@ -12,7 +12,7 @@ from jaxbundle.choices import RESAMPLINGS, Resampling
 from jaxbundle.commands.scanner_inputs import (
     surface_of,
 )
-from jaxbundle.io.rasters.scenes import read_scene, write_taken
+from jaxbundle.io.rasters.scenes import read_scene, write_scene_image
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.refinement import RefineFile, read_refinement
 from jaxbundle.io.scanner.writing import names_of, write_scanner_image
@@ -68,7 +68,7 @@ def simulate(
         path = write(new, measured)
         write(new / TRUTH, truth)
         if picture is not None:
-            write_taken(
+            write_scene_image(
                 new / IMAGE,
                 truth,
                 surface,

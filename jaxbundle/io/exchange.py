@@ -61,19 +61,21 @@ class Converted:
 
     def __str__(self) -> str:
         lines = [f"{', '.join(map(str, self.parts or (self.path,)))}: {self.kind}"]
-        costs = sorted(self.conversions.items(), key=lambda item: -item[1].largest)
-        max_shown = 8  # the worst, on one screen; `conversions` has all
-        lines += [f"camera {id!r} → {cost}" for id, cost in costs[:max_shown]]
-        if len(costs) > max_shown:
-            lines.append(f"and {len(costs) - max_shown} more cameras, with smaller differences")
+        conversions = sorted(self.conversions.items(), key=lambda item: -item[1].largest)
+        max_lines = 8  # the worst, on one screen; `conversions` has all
+        lines += [f"camera {id!r} → {conversion}" for id, conversion in conversions[:max_lines]]
+        if len(conversions) > max_lines:
+            lines.append(
+                f"and {len(conversions) - max_lines} more cameras, with smaller differences"
+            )
         lines += describe_lost(self.lost)
         lines += [f"warning: {warning}" for warning in self.warnings]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
-def describe_lost(losses: Sequence[str]) -> list[str]:
+def describe_lost(lost: Sequence[str]) -> list[str]:
     """The line about what is not kept; none if nothing is lost."""
-    return [f"not kept: {'; '.join(losses)}"] if losses else []
+    return [f"not kept: {'; '.join(lost)}"] if lost else []
 
 
 def convert(  # noqa: PLR0913, as the options of the command
@@ -119,14 +121,14 @@ def convert(  # noqa: PLR0913, as the options of the command
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):
         # Real paths: one of them may be a link.
         _refuse_overlap({os.path.realpath(input)}, {os.path.realpath(output)}, output)
-        _keep_others(output, kind, force)
+        _protect_existing(output, kind, force)
         cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
         if kind in TARGETS and TARGETS[kind].alone:
             network = network_of_cameras(cameras, str(input)).warn(*fit_messages(cameras))
             return _convert_network(network, output, kind, model, measured, force, (), tell)
-        conversion = _convert_cameras(input, cameras, output, kind, model, camera, tell)
+        converted = _convert_cameras(input, cameras, output, kind, model, camera, tell)
         return dataclasses.replace(
-            conversion, warnings=(*fit_messages(cameras), *outside_warnings(cameras))
+            converted, warnings=(*fit_messages(cameras), *outside_warnings(cameras))
         )
     network = read_network(
         input,
@@ -139,20 +141,20 @@ def convert(  # noqa: PLR0913, as the options of the command
     unread = FORMATS[format or str(recognise_format(input))].unread
     network = network.replace(cameras=_add_sizes(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))
-    _keep_input(input, network, output, kind, control)
-    _keep_others(output, kind, force, network)
+    _protect_input(input, network, output, kind, control)
+    _protect_existing(output, kind, force, network)
     if kind in CAMERA_KINDS:
-        costs = None
+        conversions = None
         if model is not None and measured:
             # The fit over the measurements needs the network; then there is nothing to convert.
-            network, costs = convert_cameras(network, model, measured=True)
+            network, conversions = convert_cameras(network, model, measured=True)
             model = None
-        conversion = _convert_cameras(
+        converted = _convert_cameras(
             input, network.cameras, output, kind, model, camera, tell, network, unread
         )
         return dataclasses.replace(
-            conversion,
-            conversions=conversion.conversions if costs is None else costs,
+            converted,
+            conversions=converted.conversions if conversions is None else conversions,
             warnings=network.warnings,
             notes=network.notes,
         )
@@ -171,41 +173,41 @@ def _convert_network(
     unread: Sequence[str],
     tell: Callable[[Sequence[str]], None],
 ) -> Converted:
-    network, costs = _with_model(network, kind, model, measured)
-    folder, files = _folder(output, kind), TARGETS[kind].files
-    losses_told = (*describe_losses(network, TARGETS[kind].losses), *unread)
-    tell(losses_told)
+    network, conversions = _convert_models(network, kind, model, measured)
+    folder, files = _output_folder(output, kind), TARGETS[kind].files
+    format_losses = (*describe_losses(network, TARGETS[kind].losses), *unread)
+    tell(format_losses)
     if folder is None:
         losses = TARGETS[kind].write(network, output)
     else:
         with replace_folder(folder, "convert", files, force) as new:
             losses = TARGETS[kind].write(network, new)
-    parts = tuple(path for path in _parts(network, output, kind) if path.exists())
+    parts = tuple(path for path in _output_paths(network, output, kind) if path.exists())
     parts = () if parts == (output,) else parts
     # A writer may meet more than the format loses by itself.
-    losses = (*losses_told, *(loss for loss in losses if loss not in losses_told))
-    return Converted(kind, output, costs, losses, network.warnings, network.notes, parts)
+    losses = (*format_losses, *(loss for loss in losses if loss not in format_losses))
+    return Converted(kind, output, conversions, losses, network.warnings, network.notes, parts)
 
 
-def _parts(network: Network, output: Path, kind: str) -> tuple[Path, ...]:
+def _output_paths(network: Network, output: Path, kind: str) -> tuple[Path, ...]:
     """The files or folders that are written."""
     target = TARGETS.get(kind)
     return (output,) if target is None or target.parts is None else target.parts(network, output)
 
 
-def _choose_kind(output: Path, to: str | None) -> str:
+def _choose_kind(output: Path, kind: str | None) -> str:
     kinds = {name: target.looks for name, target in (*TARGETS.items(), *CAMERA_KINDS.items())}
-    if to is not None:
-        if to not in kinds:
-            raise InputError(f"--to {to}: cannot be written{did_you_mean(to, kinds)}")
-        return to
-    recognised = recognise_target(output)
-    if recognised is None:
-        known_kinds = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
+    if kind is not None:
+        if kind not in kinds:
+            raise InputError(f"--to {kind}: cannot be written{did_you_mean(kind, kinds)}")
+        return kind
+    recognised_kind = recognise_target(output)
+    if recognised_kind is None:
+        choices = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
         raise InputError(
-            f"{output}: the output format is not recognised; give --to or a name: {known_kinds}"
+            f"{output}: the output format is not recognised; give --to or a name: {choices}"
         )
-    return recognised
+    return recognised_kind
 
 
 def _add_sizes(
@@ -215,7 +217,7 @@ def _add_sizes(
 ) -> tuple[Camera, ...]:
     """The cameras, with sizes added if missing."""
     sizes = {"image_size": image_size, "pixel_size": pixel_size}
-    with_sizes = tuple(
+    sized_cameras = tuple(
         dataclasses.replace(
             camera,
             **{
@@ -226,14 +228,14 @@ def _add_sizes(
         )
         for camera in cameras
     )
-    for camera in with_sizes:
+    for camera in sized_cameras:
         check_camera(camera)
-    return with_sizes
+    return sized_cameras
 
 
 def _check_path(output: Path, kind: str) -> None:
     """Refuse a path that cannot be written."""
-    folder = _folder(output, kind)
+    folder = _output_folder(output, kind)
     if folder is not None and folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; {kind} is written into a folder")
     if folder != output and output.is_dir():
@@ -242,7 +244,7 @@ def _check_path(output: Path, kind: str) -> None:
         raise InputError(f"{output}: there is no folder {output.parent}")
 
 
-def _keep_input(
+def _protect_input(
     input: Path, network: Network, output: Path, kind: str, control: str | Path | None = None
 ) -> None:
     """Refuse to replace the input: its files, and the folder that holds one of them."""
@@ -254,53 +256,53 @@ def _keep_input(
         *network.further,
     )
     # Real paths: an output may be the input by a link, or by a path with `..`.
-    input_files = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
-    folders = {os.path.realpath(Path(p).parent) for p in input_files}
-    output_files = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
+    input_paths = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
+    folders = {os.path.realpath(Path(p).parent) for p in input_paths}
+    output_paths = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
     if kind == "csv":
-        output_files.add(os.path.realpath(images_path(output)))
-    folder = _folder(output, kind)
+        output_paths.add(os.path.realpath(images_path(output)))
+    folder = _output_folder(output, kind)
     if folder is not None and os.path.realpath(folder) in folders:
-        output_files |= input_files  # who replaces the folder of an input replaces the input
+        output_paths |= input_paths  # who replaces the folder of an input replaces the input
     if control is not None:
-        input_files.add(os.path.realpath(control))
-    _refuse_overlap(input_files, output_files, output)
+        input_paths.add(os.path.realpath(control))
+    _refuse_overlap(input_paths, output_paths, output)
 
 
-def _refuse_overlap(input_files: set[str], output_files: set[str], output: Path) -> None:
-    if input_files & output_files:
+def _refuse_overlap(input_paths: set[str], output_paths: set[str], output: Path) -> None:
+    if input_paths & output_paths:
         raise InputError(f"{output} is the input and would be overwritten; give another place")
 
 
-def _folder(output: Path, kind: str) -> Path | None:
+def _output_folder(output: Path, kind: str) -> Path | None:
     """The folder to write; None for a file, with others beside it or not."""
     if kind not in TARGETS or not TARGETS[kind].files:
         return None
     return output.parent if kind == "project" and output.name == FILE_NAME else output
 
 
-def _keep_others(output: Path, kind: str, force: bool, network: Network | None = None) -> None:
+def _protect_existing(output: Path, kind: str, force: bool, network: Network | None = None) -> None:
     """Refuse to replace existing files, and folders not written by `convert`."""
-    folder = _folder(output, kind)
+    folder = _output_folder(output, kind)
     if folder is not None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
     # Files that a writer adds to the one that is named.
-    beside = {
+    companions = {
         "csv": [images_path(output)],
         "bundler": [output.parent / LIST],
         "jaicov": [output.with_suffix(suffix) for suffix in COMPANION_SUFFIXES],
     }
-    files = (output,) if network is None else _parts(network, output, kind)
-    existing = [path for path in (*files, *beside.get(kind, [])) if os.path.lexists(path)]
-    if existing and not force:
+    files = (output,) if network is None else _output_paths(network, output, kind)
+    existing_files = [path for path in (*files, *companions.get(kind, [])) if os.path.lexists(path)]
+    if existing_files and not force:
         raise InputError(
-            f"{list_some([str(path) for path in existing], 3, str)}: already there and would be "
-            "replaced; give another place, or --force"
+            f"{list_some([str(path) for path in existing_files], 3, str)}: already there and "
+            "would be replaced; give another place, or --force"
         )
 
 
-def _with_model(
+def _convert_models(
     network: Network, kind: str, model: str | CameraModel | None, measured: bool
 ) -> tuple[Network, dict[str, Conversion]]:
     """The network with camera models of the output, and the difference of each camera."""
@@ -313,19 +315,20 @@ def _with_model(
     foreign = [c.id for c in network.cameras if not has_model(models, c.model)]
     if not foreign:
         return network, {}
-    converted, costs = convert_cameras(network, models[0], only=foreign, measured=measured)
-    for id, cost in costs.items():
-        _refuse_inexact(network.cameras, id, kind, cost)
-    return converted, costs
+    converted, conversions = convert_cameras(network, models[0], only=foreign, measured=measured)
+    for id, conversion in conversions.items():
+        _refuse_inexact(network.cameras, id, kind, conversion)
+    return converted, conversions
 
 
-def _refuse_inexact(cameras: Sequence[Camera], id: str, kind: str, cost: Conversion) -> None:
-    if not cost.exact:
+def _refuse_inexact(cameras: Sequence[Camera], id: str, kind: str, conversion: Conversion) -> None:
+    if not conversion.exact:
         model = next(camera.model for camera in cameras if camera.id == id)
         raise InputError(
-            f"camera {id!r}: {kind} has no model {str(model)!r}, and {cost.model} is not the same: "
-            f"{cost.reason}; fitted over the image the largest difference is {cost.largest:.3g} "
-            f"{cost.unit}; give --model {cost.model} to accept this"
+            f"camera {id!r}: {kind} has no model {str(model)!r}, and {conversion.model} is not "
+            f"the same: {conversion.reason}; fitted over the image the largest difference is "
+            f"{conversion.largest:.3g} {conversion.unit}; give --model {conversion.model} to "
+            "accept this"
         )
 
 
@@ -348,26 +351,26 @@ def _convert_cameras(
             f"as {kind}"
         )
     camera_kind = CAMERA_KINDS[kind]
-    if camera_kind.one or id is not None:
+    if camera_kind.single or id is not None:
         cameras = [choose_camera(cameras, id, str(input))]
-    costs, converted_cameras = {}, []
+    conversions, converted_cameras = {}, []
     for camera in cameras:
         foreign = not has_model(camera_kind.models, camera.model)
-        target = model or (camera_kind.models[0] if foreign else camera.model)
-        if target != camera.model:
-            converted, costs[camera.id] = convert_one(camera, target)
+        target_model = model or (camera_kind.models[0] if foreign else camera.model)
+        if target_model != camera.model:
+            converted, conversions[camera.id] = convert_one(camera, target_model)
             if model is None:
-                _refuse_inexact(cameras, camera.id, kind, costs[camera.id])
+                _refuse_inexact(cameras, camera.id, kind, conversions[camera.id])
             camera = converted
         converted_cameras.append(camera)
     if network is None:
-        lost = describe_losses(
+        losses = describe_losses(
             network_of_cameras(converted_cameras, str(input)), camera_kind.losses
         )
     else:
-        losses = {**FILES_OF_CAMERAS, **camera_kind.losses}
-        lost = describe_losses(network.replace(cameras=tuple(converted_cameras)), losses)
-    lost = (*lost, *unread)
-    tell(lost)
+        kind_losses = {**FILES_OF_CAMERAS, **camera_kind.losses}
+        losses = describe_losses(network.replace(cameras=tuple(converted_cameras)), kind_losses)
+    losses = (*losses, *unread)
+    tell(losses)
     camera_kind.write(converted_cameras, output)
-    return Converted(kind, output, costs, lost, ())
+    return Converted(kind, output, conversions, losses, ())

@@ -152,27 +152,27 @@ class OutputFormat:
 
 @dataclasses.dataclass(frozen=True)
 class CameraTarget:
-    """A kind of output that holds cameras only: as `OutputFormat`; `one`: a single camera; `broad`:
+    """A kind of output that holds cameras only: as `OutputFormat`; `single`: one camera; `broad`:
     the name also fits other kinds, which come first."""
 
     recognises: Callable[[Path], bool]
     write: Callable[[Sequence[Camera], Path], None]
     looks: str
     models: tuple[str, ...] = ()
-    one: bool = False
+    single: bool = False
     broad: bool = False
     losses: Losses = dataclasses.field(default_factory=dict)
 
 
-def _cameras_losing(names: Callable[[Sequence[str]], Sequence[object]] | None = None) -> Losses:
+def _camera_losses(names: Callable[[Sequence[str]], Sequence[object]] | None = None) -> Losses:
     """The losses of a file of cameras; `names`: those that they get."""
-    lost_names = ("pixel sizes of cameras", "prior σ of camera parameters")
-    renamed: Losses = {}
+    quantities = ("pixel sizes of cameras", "prior σ of camera parameters")
+    name_losses: Losses = {}
     if names is not None:
-        renamed = {
+        name_losses = {
             "names of cameras": lambda n: changed(ids := [c.id for c in n.cameras], names(ids))
         }
-    return renamed | {name: QUANTITIES[name] for name in lost_names}
+    return name_losses | {name: QUANTITIES[name] for name in quantities}
 
 
 def _is_project(path: Path) -> bool:
@@ -290,26 +290,28 @@ def _write_project(network: Network, path: Path) -> Sequence[str]:
     return ()
 
 
-def _ends(*suffixes: str) -> Callable[[Path], bool]:
+def _has_suffix(*suffixes: str) -> Callable[[Path], bool]:
     return lambda path: path.suffix.lower() in suffixes
 
 
-def _folder_of(*words: str) -> Callable[[Path], bool]:
+def _folder_contains(*words: str) -> Callable[[Path], bool]:
     """A name without suffix that contains one of these words, or whose folder does."""
     return lambda path: (
         not path.suffix and any(word in part.lower() for part in path.parts[-2:] for word in words)
     )
 
 
-def _file_of(word: str, *suffixes: str) -> Callable[[Path], bool]:
+def _file_contains(word: str, *suffixes: str) -> Callable[[Path], bool]:
     return lambda path: word in path.stem.lower() and path.suffix.lower() in suffixes
 
 
-def _is_named(name: str) -> Callable[[Path], bool]:
+def _has_name(name: str) -> Callable[[Path], bool]:
     return lambda path: path.name.lower() == name
 
 
-def _write_only_camera(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera], Path], None]:
+def _single_camera_writer(
+    write: Callable[[Camera, Path], None],
+) -> Callable[[Sequence[Camera], Path], None]:
     """Writes the only camera."""
     return lambda cameras, path: write(cameras[0], path)
 
@@ -317,46 +319,46 @@ def _write_only_camera(write: Callable[[Camera, Path], None]) -> Callable[[Seque
 # The order is that of recognition; "project" takes any folder and stands last.
 TARGETS: dict[str, OutputFormat] = {
     "ply": OutputFormat(
-        _ends(".ply"),
+        _has_suffix(".ply"),
         write_ply,
         "NAME.ply",
         losses=PLY_LOSSES,
     ),
     "dxf": OutputFormat(
-        _ends(".dxf"),
+        _has_suffix(".dxf"),
         write_dxf,
         "NAME.dxf",
         losses=DXF_LOSSES,
     ),
     "realityscan-csv": OutputFormat(
-        _file_of("realityscan", ".csv"),
+        _file_contains("realityscan", ".csv"),
         write_realityscan_csv,
         "NAME.csv with realityscan in its name",
         ("opencv",),
         losses=REALITYSCAN_LOSSES,
     ),
     "csv": OutputFormat(
-        _ends(".csv"),
+        _has_suffix(".csv"),
         write_coordinates,
         "NAME.csv",
         losses=COORDINATES_LOSSES,
     ),
     "bundler": OutputFormat(
-        _ends(".out"),
+        _has_suffix(".out"),
         write_bundler,
         "NAME.out",
         ("snavely",),
         losses=BUNDLER_LOSSES,
     ),
     "bal": OutputFormat(
-        _ends(".txt", ".bal", *OPENERS),
+        _has_suffix(".txt", ".bal", *OPENERS),
         write_bal,
         "NAME.txt, .bal, .gz, .bz2",
         ("snavely",),
         losses=BAL_LOSSES,
     ),
     "colmap": OutputFormat(
-        _folder_of("colmap", "sparse"),
+        _folder_contains("colmap", "sparse"),
         partial(fill_colmap, text=False),
         "a folder with colmap or sparse in its name",
         COLMAP_MODELS,
@@ -372,14 +374,14 @@ TARGETS: dict[str, OutputFormat] = {
         losses=COLMAP_LOSSES,
     ),
     "openmvg": OutputFormat(
-        _file_of("sfm_data", ".json"),
+        _file_contains("sfm_data", ".json"),
         write_openmvg,
         "NAME.json with sfm_data in its name",
         PIXEL_MODELS,
         losses=OPENMVG_LOSSES,
     ),
     "opensfm": OutputFormat(
-        _folder_of("opensfm"),
+        _folder_contains("opensfm"),
         fill_opensfm,
         "a folder with opensfm in its name",
         PIXEL_MODELS,
@@ -387,14 +389,14 @@ TARGETS: dict[str, OutputFormat] = {
         losses=OPENSFM_LOSSES,
     ),
     "alicevision": OutputFormat(
-        _ends(".sfm"),
+        _has_suffix(".sfm"),
         write_alicevision,
         "NAME.sfm",
         PIXEL_MODELS,
         losses=ALICEVISION_LOSSES,
     ),
     "transforms": OutputFormat(
-        _file_of("transforms", ".json"),
+        _file_contains("transforms", ".json"),
         write_transforms,
         "NAME.json with transforms in its name",
         PIXEL_MODELS,
@@ -402,7 +404,7 @@ TARGETS: dict[str, OutputFormat] = {
         losses=TRANSFORMS_LOSSES,
     ),
     "kalibr": OutputFormat(
-        _file_of("camchain", *YAML),
+        _file_contains("camchain", *YAML),
         write_kalibr,
         "NAME.yaml with camchain in its name",
         KALIBR_MODELS,
@@ -418,14 +420,14 @@ TARGETS: dict[str, OutputFormat] = {
         losses=MICMAC_LOSSES,
     ),
     "jaicov": OutputFormat(
-        _ends(".phc"),
+        _has_suffix(".phc"),
         write_jaicov,
         "NAME.phc",
         ("brown-projected",),
         losses=JAICOV_LOSSES,
     ),
     "mrcal": OutputFormat(
-        _folder_of("mrcal"),
+        _folder_contains("mrcal"),
         fill_mrcal,
         "a folder with mrcal in its name",
         MRCAL_MODELS,
@@ -434,7 +436,7 @@ TARGETS: dict[str, OutputFormat] = {
         losses=MRCAL_LOSSES,
     ),
     "opencv-stereo": OutputFormat(
-        _file_of("stereo", *OPENCV_SUFFIXES),
+        _file_contains("stereo", *OPENCV_SUFFIXES),
         write_opencv_stereo,
         "NAME.yaml, .yml, .json with stereo in its name",
         PIXEL_MODELS,
@@ -442,7 +444,7 @@ TARGETS: dict[str, OutputFormat] = {
         parts=opencv_stereo_files,
     ),
     "ros-stereo": OutputFormat(
-        _folder_of("camera_info"),
+        _folder_contains("camera_info"),
         fill_ros_stereo,
         "a folder with camera_info in its name",
         PIXEL_MODELS,
@@ -451,7 +453,7 @@ TARGETS: dict[str, OutputFormat] = {
         parts=ros_stereo_folders,
     ),
     "anipose": OutputFormat(
-        _file_of("calibration", ".toml"),
+        _file_contains("calibration", ".toml"),
         write_anipose,
         "NAME.toml with calibration in its name",
         PIXEL_MODELS,
@@ -459,7 +461,7 @@ TARGETS: dict[str, OutputFormat] = {
         losses=ANIPOSE_LOSSES,
     ),
     "realityscan": OutputFormat(
-        _folder_of("realityscan"),
+        _folder_contains("realityscan"),
         fill_realityscan,
         "a folder with realityscan in its name",
         ("opencv",),
@@ -476,53 +478,53 @@ TARGETS: dict[str, OutputFormat] = {
 # Outputs that hold cameras only.
 CAMERA_KINDS: dict[str, CameraTarget] = {
     "colmap-cameras": CameraTarget(
-        _is_named("cameras.txt"),
+        _has_name("cameras.txt"),
         write_colmap_cameras,
         "cameras.txt",
         COLMAP_MODELS,
-        losses=_cameras_losing(numbers_of),
+        losses=_camera_losses(numbers_of),
     ),
     "opensfm-cameras": CameraTarget(
-        _is_named("camera_models.json"),
+        _has_name("camera_models.json"),
         write_opensfm_cameras,
         "camera_models.json",
         PIXEL_MODELS,
-        losses=_cameras_losing(),
+        losses=_camera_losses(),
     ),
     "ros": CameraTarget(
-        _file_of("camera_info", *YAML),
-        _write_only_camera(write_ros),
+        _file_contains("camera_info", *YAML),
+        _single_camera_writer(write_ros),
         "NAME.yaml with camera_info in its name",
         PIXEL_MODELS,
-        one=True,
-        losses=_cameras_losing(lambda ids: [None] * len(ids)),
+        single=True,
+        losses=_camera_losses(lambda ids: [None] * len(ids)),
     ),
     "cameramodel": CameraTarget(
-        _ends(".cameramodel"),
-        _write_only_camera(write_cameramodel),
+        _has_suffix(".cameramodel"),
+        _single_camera_writer(write_cameramodel),
         "NAME.cameramodel",
         MRCAL_MODELS,
-        one=True,
-        losses=_cameras_losing(lambda ids: [None] * len(ids)),
+        single=True,
+        losses=_camera_losses(lambda ids: [None] * len(ids)),
     ),
     "autocal": CameraTarget(
-        _file_of("autocal", ".xml"),
-        _write_only_camera(write_autocal),
+        _file_contains("autocal", ".xml"),
+        _single_camera_writer(write_autocal),
         "NAME.xml with autocal in its name",
         MICMAC_MODELS,
-        one=True,
-        losses=_cameras_losing(lambda ids: [None] * len(ids)),
+        single=True,
+        losses=_camera_losses(lambda ids: [None] * len(ids)),
     ),
     "opencv": CameraTarget(
-        _ends(*YAML, ".json"),
-        _write_only_camera(write_opencv),
+        _has_suffix(*YAML, ".json"),
+        _single_camera_writer(write_opencv),
         "NAME.yaml, .yml, .json",
         PIXEL_MODELS,
-        one=True,
-        losses=_cameras_losing(lambda ids: [None] * len(ids)),
+        single=True,
+        losses=_camera_losses(lambda ids: [None] * len(ids)),
         broad=True,
     ),
-    "cameras": CameraTarget(_ends(".toml"), write_cameras, "NAME.toml", broad=True),
+    "cameras": CameraTarget(_has_suffix(".toml"), write_cameras, "NAME.toml", broad=True),
 }
 
 
@@ -587,9 +589,9 @@ def read_network(
         )
     if format is not None and text("format", format) not in FORMATS:
         if format in TARGETS or format == "opencv":
-            restriction = "contains only a camera" if format == "opencv" else "is written only"
+            limitation = "contains only a camera" if format == "opencv" else "is written only"
             raise InputError(
-                f"--format {format}: {restriction}; a network is read as {', '.join(FORMATS)}"
+                f"--format {format}: {limitation}; a network is read as {', '.join(FORMATS)}"
             )
         raise InputError(f"unknown format {format!r}{did_you_mean(format, FORMATS)}")
     if not os.path.exists(file_of_line(path)):
@@ -601,16 +603,16 @@ def read_network(
             "or another network (jaxbundle camera, compare and convert read it)"
         )
     if format is None:
-        if incomplete := describe_incomplete(path):
-            raise InputError(f"{path}: {incomplete}")
+        if description := describe_incomplete(path):
+            raise InputError(f"{path}: {description}")
         raise InputError(f"{path}: the kind of input is not recognised; {expected_inputs(path)}")
     # Read before the network, which may take long: its errors come at once.
     control_points = None if control is None else read_control(control)
     # Other formats have names of their own for their models.
-    own_models = (check_own_models(models),) if FORMATS[format].names_models else ()
+    model_arguments = (check_own_models(models),) if FORMATS[format].names_models else ()
     sized = image_size is not None and FORMATS[format].takes_image_size
     sizes = {"image_size": image_size} if sized else {}
-    network = FORMATS[format].read(path, overrides, *own_models, **sizes)
+    network = FORMATS[format].read(path, overrides, *model_arguments, **sizes)
     if control_points is not None:
         return with_control(network, control_points, datum=not choose_datum(overrides))
     return _with_adjusted_control(network) if FORMATS[format].adjusted else network
@@ -674,8 +676,10 @@ def _with_adjusted_control(network: Network) -> Network:
     held_ids = [id for id, role in zip(points.id, points.role) if role == "fixed"]
     weighted = points.role.count("control")
     if held_ids:
-        points = count(len(held_ids), "control point")
-        network = network.note(f"{points} without positive σ held as fixed: {list_some(held_ids)}")
+        held_count = count(len(held_ids), "control point")
+        network = network.note(
+            f"{held_count} without positive σ held as fixed: {list_some(held_ids)}"
+        )
     if weighted:
         network = network.warn(
             f"the file gives {count(weighted, 'control point')} with adjusted coordinates and a "

@@ -139,8 +139,8 @@ def make_network(  # noqa: PLR0913 - the tables of a network
     points = _make_points(as_columns(points, "points"))
     observations = as_columns(observations, "observations")
     # Some rows with σ and some without: 1 unit of weight beside real σ is most likely a mistake.
-    lacking = np.isnan(_matrix(observations, OBSERVATION_SIGMAS))
-    mixed = sigma_image is None and lacking.any() and not lacking.all()
+    lacks_sigma = np.isnan(_matrix(observations, OBSERVATION_SIGMAS))
+    is_partial = sigma_image is None and lacks_sigma.any() and not lacks_sigma.all()
     observations = _make_observations(observations, images, points, sigma_image, sigma_origin)
     xy, sigma = from_image_unit(
         cameras, images.camera[observations.image], observations.xy, observations.sigma, image_unit
@@ -159,12 +159,12 @@ def make_network(  # noqa: PLR0913 - the tables of a network
         further=make_further(further, ANGLE_UNITS[angle_unit]),
         **settings,
     )
-    for kind in network.further:
-        kind.check(network)
-    if mixed:
+    for table in network.further:
+        table.check(network)
+    if is_partial:
         network = network.warn(
-            f"{count(int(lacking.sum()), 'image coordinate')} of {lacking.size} without σ: theirs "
-            f"is 1 {image_unit}, beside those given; give sigma_image"
+            f"{count(int(lacks_sigma.sum()), 'image coordinate')} of {lacks_sigma.size} without "
+            f"σ: theirs is 1 {image_unit}, beside those given; give sigma_image"
         )
     return network
 
@@ -183,40 +183,44 @@ def add_further(network: Network, *, angle_unit: str | None = None, **further: A
 
     **Raises:** `InputError` naming table, row and column.
     """
-    angle_unit_of_network = require_network(network).angle_unit
-    angle_unit = angle_unit_of_network if angle_unit is None else angle_unit
+    network_unit = require_network(network).angle_unit
+    angle_unit = network_unit if angle_unit is None else angle_unit
     check_choice("angle_unit", angle_unit, CHOICES["angle_unit"])
-    new_kinds = make_further(further, ANGLE_UNITS[angle_unit])
-    for kind in new_kinds:
-        if angle_unit != angle_unit_of_network and kind.ANGLES_IN_SETTINGS and kind.settings:
+    new_tables = make_further(further, ANGLE_UNITS[angle_unit])
+    for table in new_tables:
+        if angle_unit != network_unit and table.ANGLES_IN_SETTINGS and table.settings:
             raise InputError(
-                f"add_further: the settings of [{kind.SECTION}] are in the unit of the network, "
-                f"{angle_unit_of_network}: expected the table in {angle_unit_of_network} too, got "
-                f"angle_unit {angle_unit!r}"
+                f"add_further: the settings of [{table.SECTION}] are in the unit of the network, "
+                f"{network_unit}: expected the table in {network_unit} too, got angle_unit "
+                f"{angle_unit!r}"
             )
-    new = {kind.TABLE for kind in new_kinds}
-    other_kinds = tuple(kind for kind in network.further if kind.TABLE not in new)
-    network = network.replace(further=(*other_kinds, *new_kinds))
-    for kind in new_kinds:
-        kind.check(network)
+    new_names = {table.TABLE for table in new_tables}
+    kept_tables = tuple(table for table in network.further if table.TABLE not in new_names)
+    network = network.replace(further=(*kept_tables, *new_tables))
+    for table in new_tables:
+        table.check(network)
     return network
 
 
-def make_further(tables: Mapping[str, Any], radians: float) -> tuple[ObservationTable, ...]:
+def make_further(
+    tables_and_settings: Mapping[str, Any], radians: float
+) -> tuple[ObservationTable, ...]:
     """Observations of further kinds from their tables and the settings of their sections.
 
     **Raises:** `InputError`, also for an unknown name, and for settings without a table."""
     known_names = (*KINDS, *SECTIONS)
-    for name in tables:
+    for name in tables_and_settings:
         refuse_unknown(name, known_names, "", "table")
-    kinds = []
+    tables = []
     for name, kind in KINDS.items():
-        settings = tables.get(kind.SECTION, {})
-        if tables.get(name) is not None:
-            kinds.append(kind.from_columns(as_columns(tables[name], name), settings, radians))
+        settings = tables_and_settings.get(kind.SECTION, {})
+        if tables_and_settings.get(name) is not None:
+            tables.append(
+                kind.from_columns(as_columns(tables_and_settings[name], name), settings, radians)
+            )
         elif settings:
             raise InputError(f"[{kind.SECTION}] is given, but no table {name}")
-    return tuple(kinds)
+    return tuple(tables)
 
 
 def make_cameras(
@@ -239,17 +243,17 @@ def make_cameras(
             f"{where}cameras: expected Camera objects, dict rows or a data frame of pandas, not "
             f"{show(cameras)}"
         )
-    cameras_made = tuple(
+    checked_cameras = tuple(
         camera if isinstance(camera, Camera) else _camera(camera, number, where, models)
         for number, camera in enumerate(cameras, 1)
     )
-    if not cameras_made:
+    if not checked_cameras:
         raise InputError(f"{where}no camera is given; give at least one")
-    for camera in cameras_made:
+    for camera in checked_cameras:
         check_camera(camera, where)
-    check_unique([camera.id for camera in cameras_made], Source(f"{where}cameras"), "camera")
-    check_models(cameras_made, where)
-    return cameras_made
+    check_unique([camera.id for camera in checked_cameras], Source(f"{where}cameras"), "camera")
+    check_models(checked_cameras, where)
+    return checked_cameras
 
 
 def _camera(
@@ -259,7 +263,7 @@ def _camera(
     if not id:
         raise InputError(f"{where}camera {number}: id is missing")
     model = row.get("model", "brown")
-    model = next((own_model for own_model in models if own_model.name == model), model)
+    model = next((user_model for user_model in models if user_model.name == model), model)
     where = f"{where}camera {id!r}: "
     parameters = {key: value for key, value in row.items() if key not in CAMERA_FIELDS}
     if isinstance(model, CameraModel) or is_known(model):
@@ -267,9 +271,9 @@ def _camera(
         for key in parameters:
             refuse_unknown(key, (*CAMERA_FIELDS, *known_parameters), where)
     sigma, observed = row.get("sigma", {}), row.get("observed", {})
-    for key, values in (("sigma", sigma), ("observed", observed)):
-        if not isinstance(values, Mapping):
-            raise InputError(f"{where}{key} is {values!r}; expected a table such as {{ c = 0.1 }}")
+    for key, mapping in (("sigma", sigma), ("observed", observed)):
+        if not isinstance(mapping, Mapping):
+            raise InputError(f"{where}{key} is {mapping!r}; expected a table such as {{ c = 0.1 }}")
     free = row.get("free", ())
     if isinstance(free, str):
         free = [name.strip() for name in free.split(",") if name.strip()]
@@ -290,8 +294,8 @@ def _camera(
 
 def _ties(where: str, groups: Any) -> tuple[tuple[str, ...], ...]:
     """Groups of names of parameters."""
-    listed = lambda g: isinstance(g, Sequence) and not isinstance(g, str)
-    if not listed(groups) or not all(listed(g) and len(g) > 1 for g in groups):
+    is_list = lambda g: isinstance(g, Sequence) and not isinstance(g, str)
+    if not is_list(groups) or not all(is_list(g) and len(g) > 1 for g in groups):
         raise InputError(
             f'{where}tie is {show(groups)}; expected groups of names such as [["fx", "fy"]]'
         )
@@ -312,13 +316,13 @@ def _pair(where: str, key: str, value: Any, kind: type) -> tuple | None:
         return None
     if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray) or len(value) != 2:
         raise InputError(f"{where}{key} is {value!r}; expected two numbers [horizontal, vertical]")
-    first_number, second_number = (_number(where, key, v) for v in value)
-    if kind is int and not (first_number.is_integer() and second_number.is_integer()):
+    horizontal, vertical = (_number(where, key, v) for v in value)
+    if kind is int and not (horizontal.is_integer() and vertical.is_integer()):
         raise InputError(f"{where}{key} is {list(value)}; expected whole numbers of pixels")
-    return kind(first_number), kind(second_number)
+    return kind(horizontal), kind(vertical)
 
 
-def _index(ids: Sequence[str]) -> dict[str, int]:
+def _row_by_id(ids: Sequence[str]) -> dict[str, int]:
     return {id: row for row, id in enumerate(ids)}
 
 
@@ -338,7 +342,9 @@ def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> I
     exterior = _matrix(table, EXTERIOR) * unit
     return Images(
         id=ids,
-        camera=table.indices("camera", "camera", _index([c.id for c in cameras]), "the cameras"),
+        camera=table.indices(
+            "camera", "camera", _row_by_id([c.id for c in cameras]), "the cameras"
+        ),
         position=exterior[:, :3],
         angles=exterior[:, 3:],
         sigma=_matrix(table, IMAGE_SIGMAS, words={"fixed": 0.0}) * unit,
@@ -400,19 +406,19 @@ def _make_observations(
     )
 
 
-def _rows_in(table_of_ids: Images | Points, table: Columns, name: str) -> Int[np.ndarray, " rays"]:
+def _rows_in(objects: Images | Points, table: Columns, name: str) -> Int[np.ndarray, " rays"]:
     """The rows of images or points that a column names."""
     values = table.column(name)
     if isinstance(values, RepeatedIds) and values.are_rows:
         return values.codes
-    return table.indices(name, name, _index(table_of_ids.id), table_of_ids.source.name)
+    return table.indices(name, name, _row_by_id(objects.id), objects.source.name)
 
 
 def _make_distances(table: Columns, points: Points) -> Distances:
     if not len(table):
         return Distances.none()
     table.check_names(DISTANCE_COLUMNS)
-    index = _index(points.id)
+    index = _row_by_id(points.id)
     ends = [table.indices(name, "point", index, points.source.name) for name in ("from", "to")]
     return Distances(
         points=np.stack(ends, 1),

@@ -39,14 +39,14 @@ class CameraTable:
 
     def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
         """The table; only parameters that are free in some camera are unknowns."""
-        own_cameras = [cameras[c] for c in self.cameras]
-        unknowns = [camera.unknowns for camera in own_cameras]
+        table_cameras = [cameras[c] for c in self.cameras]
+        unknowns = [camera.unknowns for camera in table_cameras]
         free = np.array([[name in names for name in self.parameters] for names in unknowns])
         # Columns that are free in no camera are constants of the formula, not unknowns held at 0:
         # the reduced matrix is smaller.
         moving = tuple(np.flatnonzero(free.any(0)).tolist())
         column_of = self.parameters.index
-        equal_columns = tuple(
+        tied_columns = tuple(
             (column_of(name), moving.index(column_of(group[0])))
             for group in self.tie
             if column_of(group[0]) in moving
@@ -55,9 +55,9 @@ class CameraTable:
         return ls.Table(
             self.name,
             self.start(cameras),
-            Vector(len(self.parameters), moving, equal_columns),
+            Vector(len(self.parameters), moving, tied_columns),
             free[:, moving],
-            [camera.id for camera in own_cameras],
+            [camera.id for camera in table_cameras],
             tuple(self.parameters[j] for j in moving),
             "camera",
         )
@@ -67,18 +67,18 @@ def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
     """Groups of cameras that share a table: those of one model with the same ties."""
     # One table a model, since its rows have the same columns and one compiled formula; ties are
     # part of the space of a table, so cameras with other ties have their own.
-    sorts = [(get_model(c.model), c.tie) for c in cameras]
-    different = tuple(dict.fromkeys(sorts))
+    keys = [(get_model(c.model), c.tie) for c in cameras]
+    distinct_keys = tuple(dict.fromkeys(keys))
     name_of = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])
     return tuple(
         CameraTable(
-            "camera" if len(different) == 1 else name_of(model, tie),
+            "camera" if len(distinct_keys) == 1 else name_of(model, tie),
             key_of(model),
             model.parameters,
-            np.array([c for c, s in enumerate(sorts) if s == (model, tie)]),
+            np.array([c for c, s in enumerate(keys) if s == (model, tie)]),
             tie,
         )
-        for model, tie in different
+        for model, tie in distinct_keys
     )
 
 

@@ -63,9 +63,9 @@ def check_network(network: Network) -> Network:
     network = check_single_strip(network)
     network = warn_of_repetitions(network)
     network = _note_points_behind(network)
-    without_repetition = lambda lines: tuple(dict.fromkeys(lines))
+    without_repeats = lambda lines: tuple(dict.fromkeys(lines))
     return network.replace(
-        warnings=without_repetition(network.warnings), notes=without_repetition(network.notes)
+        warnings=without_repeats(network.warnings), notes=without_repeats(network.notes)
     )
 
 
@@ -91,11 +91,10 @@ def _check_sizes(network: Network) -> None:
         raise InputError("the network has no camera; give at least one")
     images, points, observations = network.images, network.points, network.observations
     tables = (images, "images"), (points, "points"), (observations, "image points")
-    for table, rows_in_words in tables:
+    for table, noun in tables:
         if not len(table):
             raise InputError(
-                f"{table.source.name}: the table is empty: there are no {rows_in_words}; give at "
-                "least one"
+                f"{table.source.name}: the table is empty: there are no {noun}; give at least one"
             )
     n, p, r, d = len(images), len(points), len(observations), len(network.distances)
     shapes = (
@@ -111,7 +110,7 @@ def _check_sizes(network: Network) -> None:
                     f"{table.source.name}: {name} has the shape "
                     f"{np.shape(getattr(table, name))}, expected {shape}"
                 )
-    for table, name, rows_in_words, size in (
+    for table, name, noun, size in (
         (images, "camera", "cameras", len(network.cameras)),
         (observations, "image", "images", n),
         (observations, "point", "points", p),
@@ -120,8 +119,7 @@ def _check_sizes(network: Network) -> None:
         index = np.asarray(getattr(table, name))
         for row, *_ in np.argwhere((index < 0) | (index >= size))[:1]:
             raise InputError(
-                f"{table.source(row)}: {name} index {index[row]} is not among the {size} "
-                f"{rows_in_words}"
+                f"{table.source(row)}: {name} index {index[row]} is not among the {size} {noun}"
             )
 
 
@@ -150,14 +148,14 @@ def _check_cameras(network: Network) -> Network:
     used_cameras, index = np.unique(network.images.camera, return_inverse=True)
     if len(used_cameras) == len(network.cameras):
         return network
-    unused = [c.id for i, c in enumerate(network.cameras) if i not in used_cameras]
+    unused_ids = [c.id for i, c in enumerate(network.cameras) if i not in used_cameras]
     images = network.images
     images = Images(
         images.id, index.reshape(-1), images.position, images.angles, images.sigma, images.source
     )
     cameras = tuple(network.cameras[i] for i in used_cameras)
     return network.replace(cameras=cameras, images=images).note(
-        f"left out {count(len(unused), 'camera')} without images: {list_some(unused)}"
+        f"left out {count(len(unused_ids), 'camera')} without images: {list_some(unused_ids)}"
     )
 
 
@@ -198,10 +196,10 @@ def _check_images(network: Network) -> None:
         lambda _row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
     )
     # A rotation changes by a vector δθ in the camera frame: no column of it is one angle.
-    number_held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
+    held_angles = (sigma[:, 3:] == 0).sum(1, keepdims=True)
     _refuse(
         images,
-        (number_held > 0) & (number_held < 3),
+        (held_angles > 0) & (held_angles < 3),
         "image",
         lambda _row, _k: (
             "omega, phi, kappa can be held fixed only all three together; give the "
@@ -233,7 +231,7 @@ def _check_points(network: Network) -> Network:
         lambda row, k: f"{AXES[k]} is missing; a {points.role[row]} point needs its coordinates",
     )
     control = points.has_role("control")
-    without_sigma, without_axis = (
+    without_sigma, uncontrolled = (
         control & np.isnan(sigma).all(1),
         control & np.isposinf(sigma).all(1),
     )
@@ -255,24 +253,24 @@ def _check_points(network: Network) -> Network:
             'or write "free" for an axis that is not controlled'
         ),
     )
-    unused = points.has_role("tie", "fixed") & ~np.isnan(sigma).all(1)
+    has_unused_sigma = points.has_role("tie", "fixed") & ~np.isnan(sigma).all(1)
     network = network.replace(
-        points=with_roles(with_roles(points, without_sigma, "fixed"), without_axis, "tie")
+        points=with_roles(with_roles(points, without_sigma, "fixed"), uncontrolled, "tie")
     )
-    if unused.any():
+    if has_unused_sigma.any():
         network = network.note(
-            f"σ of {count(unused.sum(), 'tie or fixed point')} not used (only control points "
-            f"have one): {_names(points, unused)}"
+            f"σ of {count(has_unused_sigma.sum(), 'tie or fixed point')} not used (only control "
+            f"points have one): {_list_points(points, has_unused_sigma)}"
         )
-    if without_axis.any():
+    if uncontrolled.any():
         network = network.note(
-            f"{count(without_axis.sum(), 'control point')} with all axes free taken as tie: "
-            f"{_names(points, without_axis)}"
+            f"{count(uncontrolled.sum(), 'control point')} with all axes free taken as tie: "
+            f"{_list_points(points, uncontrolled)}"
         )
     return network
 
 
-def _names(points: Points, mask: Bool[np.ndarray, " points"]) -> str:
+def _list_points(points: Points, mask: Bool[np.ndarray, " points"]) -> str:
     return list_some(points.id[row] for row in np.flatnonzero(mask))
 
 
@@ -290,13 +288,12 @@ def _check_observations(network: Network) -> None:
             f"{sigma[row, k]:g}; it must be finite and positive: correct it, or leave it empty to "
             "use sigma_image"
         )
-    smallest_sigma = np.finfo(float).eps * np.abs(observations.xy).max()
-    for row, k in np.argwhere(sigma < smallest_sigma)[:1]:
+    last_digit = np.finfo(float).eps * np.abs(observations.xy).max()
+    for row, k in np.argwhere(sigma < last_digit)[:1]:
         raise InputError(
             f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
             f"{sigma[row, k]:g}, less than the last digit of the image coordinates "
-            f"({smallest_sigma:.1g}); "
-            "give it, or sigma_image, in the unit of the coordinates"
+            f"({last_digit:.1g}); give it, or sigma_image, in the unit of the coordinates"
         )
     # One number for image and point, so that millions of rows are compared by a sort.
     key = observations.image.astype(np.int64) * len(network.points) + observations.point
@@ -340,15 +337,15 @@ def _check_distances(network: Network) -> Network:
 
 def _note_rows_of_check_points(network: Network) -> Network:
     """Say which rows of further kinds are about check points, which take no part."""
-    check = {id for id, role in zip(network.points.id, network.points.role) if role == "check"}
-    for kind in network.further if check else ():
-        is_about_check = np.zeros(len(kind), bool)
-        for field in kind.POINTS:
-            is_about_check |= np.array([id in check for id in getattr(kind, field)], bool)
-        if is_about_check.any():
+    check_ids = {id for id, role in zip(network.points.id, network.points.role) if role == "check"}
+    for table in network.further if check_ids else ():
+        of_check_points = np.zeros(len(table), bool)
+        for field in table.POINTS:
+            of_check_points |= np.array([id in check_ids for id in getattr(table, field)], bool)
+        if of_check_points.any():
             network = network.note(
-                f"{kind.source(int(is_about_check.argmax()))}: {is_about_check.sum()} of "
-                f"{len(kind)} {kind.TABLE} are "
+                f"{table.source(int(of_check_points.argmax()))}: {of_check_points.sum()} of "
+                f"{len(table)} {table.TABLE} are "
                 "about check points, which take no part in the adjustment, and are left out"
             )
     return network
@@ -389,15 +386,15 @@ def _refuse_missing(
     names: Sequence[str],
     noun: str,
 ) -> None:
-    is_missing = np.isnan(values)
-    number_of_others = is_missing.any(1).sum() - 1
-    others_in_words = f" (and {number_of_others} more)" if number_of_others > 0 else ""
+    is_nan = np.isnan(values)
+    other_rows = is_nan.any(1).sum() - 1
+    suffix = f" (and {other_rows} more)" if other_rows > 0 else ""
     _refuse(
         table,
-        is_missing,
+        is_nan,
         noun,
         lambda _row, k: (
-            f"{names[k]} has no start value{others_in_words}; give start values, or find them with "
+            f"{names[k]} has no start value{suffix}; give start values, or find them with "
             "jaxbundle.orient"
         ),
     )
@@ -407,13 +404,13 @@ def _note_points_behind(network: Network) -> Network:
     """A note if a start value puts a point behind the camera that sees it (q ≥ 0); fisheyes may
     see behind them."""
     images, rays = network.images, network.observations
-    plain = [get_model(camera.model).image == "perspective" for camera in network.cameras]
+    is_perspective = [get_model(camera.model).image == "perspective" for camera in network.cameras]
     # The third row of M, the axis of the camera in object space: q = axis·(X − X0) < 0 in front.
     omega, phi, _ = images.angles.T
     axis = np.stack([np.sin(phi), -np.cos(phi) * np.sin(omega), np.cos(phi) * np.cos(omega)], 1)
     ray = network.points.position[rays.point] - images.position[rays.image]
-    is_before = (axis[rays.image] * ray).sum(1) < 0
-    rows_behind = np.flatnonzero(~is_before & np.array(plain)[images.camera[rays.image]])
+    is_in_front = (axis[rays.image] * ray).sum(1) < 0
+    rows_behind = np.flatnonzero(~is_in_front & np.array(is_perspective)[images.camera[rays.image]])
     if not len(rows_behind):
         return network
     examples = "; ".join(_sighting(network, row) for row in rows_behind[:3])

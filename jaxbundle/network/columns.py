@@ -144,29 +144,29 @@ class Columns:
         return number
 
     def indices(
-        self, name: str, noun: str, index_of: Mapping[str, int], where: str
+        self, name: str, noun: str, row_by_id: Mapping[str, int], where: str
     ) -> Int[np.ndarray, " rows"]:
         """A column of ids as indices into another table (`noun`s in `where`)."""
         # Millions of rows: looked up at once, and searched for the unknown id only if there is one.
         values = self.column(name)
         try:
             if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
-                different, codes = np.unique(values, return_inverse=True)
-                values = RepeatedIds(different, codes)
+                distinct, codes = np.unique(values, return_inverse=True)
+                values = RepeatedIds(distinct, codes)
             if isinstance(values, RepeatedIds):
-                positions = [index_of.get(label, -1) for label in values.texts()]
-                indices = np.array(positions, np.int64)[values.codes]
+                rows_of_labels = [row_by_id.get(label, -1) for label in values.texts()]
+                indices = np.array(rows_of_labels, np.int64)[values.codes]
                 if indices.size and indices.min() < 0:
                     raise KeyError
                 return indices
             ids = self.ids(name)
-            return np.fromiter(map(index_of.__getitem__, ids), np.int64, len(ids))
+            return np.fromiter(map(row_by_id.__getitem__, ids), np.int64, len(ids))
         except KeyError:
             ids = self.ids(name)
-            row = next(row for row, id in enumerate(ids) if id not in index_of)
+            row = next(row for row, id in enumerate(ids) if id not in row_by_id)
             raise InputError(
                 f"{self.source(row)}: {name} {ids[row]!r} is unknown: no such {noun} in {where}"
-                f"{did_you_mean(ids[row], list(index_of), listing=False)}"
+                f"{did_you_mean(ids[row], list(row_by_id), listing=False)}"
             ) from None
 
 
@@ -198,8 +198,10 @@ def as_columns(table: Any, name: str) -> Columns:
 def _of_frame(table: Any, source: Source) -> Columns:
     names = [str(column) for column in table.columns]
     if len({*names}) < len(names):
-        twice = next(column for column in names if names.count(column) > 1)
-        raise InputError(f"{source.name}: two columns are called {twice!r}; expected one of each")
+        duplicate = next(column for column in names if names.count(column) > 1)
+        raise InputError(
+            f"{source.name}: two columns are called {duplicate!r}; expected one of each"
+        )
     present = table.notna()
     return Columns(
         {
@@ -239,15 +241,15 @@ def is_missing(value: Any) -> bool:
 def did_you_mean(name: str, known_names: Iterable[str], *, listing: bool = True) -> str:
     """The end of a message about an unknown name: the closest known one, or all of them."""
     known_names = list(known_names)
-    close = closest_name(name, known_names)
-    if close is not None:
-        return f"; did you mean {close!r}?"
+    closest = closest_name(name, known_names)
+    if closest is not None:
+        return f"; did you mean {closest!r}?"
     return f"; known: {', '.join(known_names)}" if listing and known_names else ""
 
 
 def refuse_unknown(name: str, known_names: Iterable[str], where: str, noun: str = "key") -> None:
-    """Refuse a name other than the `known_names` ones, as a probable typing error: a setting that
-    is silently ignored would give another result than the user expects.
+    """Refuse a name that is not in `known_names`, as a probable typing error: a setting that is
+    silently ignored would give another result than the user expects.
 
     **Arguments:** `where` begins the message; `noun`: what the name is of, `section` in brackets.
 
@@ -255,8 +257,8 @@ def refuse_unknown(name: str, known_names: Iterable[str], where: str, noun: str 
     """
     known_names = tuple(known_names)
     if name not in known_names:
-        shown_name = f"[{name}]" if noun == "section" else repr(name)
-        raise InputError(f"{where}unknown {noun} {shown_name}{did_you_mean(name, known_names)}")
+        quoted = f"[{name}]" if noun == "section" else repr(name)
+        raise InputError(f"{where}unknown {noun} {quoted}{did_you_mean(name, known_names)}")
 
 
 def quote(name: Any) -> str:
@@ -264,16 +266,18 @@ def quote(name: Any) -> str:
     return repr(str(name))
 
 
-def list_some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = quote) -> str:
+def list_some(
+    names: Iterable[Any], max_names: int = 5, as_text: Callable[[Any], str] = quote
+) -> str:
     """The first few names of a list, and the number of others."""
     names = list(names)
-    text = ", ".join(map(as_text, names[:most]))
-    return f"{text} and {len(names) - most} more" if len(names) > most else text
+    text = ", ".join(map(as_text, names[:max_names]))
+    return f"{text} and {len(names) - max_names} more" if len(names) > max_names else text
 
 
-def count(number: SupportsIndex, noun: str, ending: str = "") -> str:
+def count(number: SupportsIndex, noun: str, suffix: str = "") -> str:
     """A count in words: "1 image", "3 images", "3 images held"."""
-    return f"{number} {noun}{'' if index(number) == 1 else 's'}{ending}"
+    return f"{number} {noun}{'' if index(number) == 1 else 's'}{suffix}"
 
 
 def _id(value: Any) -> str:
@@ -299,5 +303,5 @@ def _plain_numbers(values: Column) -> np.ndarray | None:
         return None
     # float() takes more than a table means: "nan", "inf", "1_000".
     texts = [value for value in values if isinstance(value, str)]
-    odd = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
-    return None if odd else numbers
+    is_unusual = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
+    return None if is_unusual else numbers

@@ -58,14 +58,9 @@ def convert_cameras(
         if camera.model == model or (only is not None and camera.id not in only):
             cameras.append(camera)
             continue
-        is_of_camera = of_ray == c
-        converted_camera, conversion, shift, step = _convert(
-            camera, model, r0, xy[is_of_camera], measured
-        )
-        xy[is_of_camera], sigma[is_of_camera] = (
-            shift + step * xy[is_of_camera],
-            np.abs(step) * sigma[is_of_camera],
-        )
+        mask = of_ray == c
+        converted_camera, conversion, shift, step = _convert(camera, model, r0, xy[mask], measured)
+        xy[mask], sigma[mask] = shift + step * xy[mask], np.abs(step) * sigma[mask]
         cameras.append(converted_camera)
         conversions[camera.id] = conversion
     units = {get_model(camera.model).unit for camera in cameras}
@@ -74,15 +69,15 @@ def convert_cameras(
         observations=dataclasses.replace(rays, xy=xy, sigma=sigma),
         image_unit=units.pop() if conversions and len(units) == 1 else network.image_unit,
     )
-    kept_kinds = tuple(kind for kind in network.further if not isinstance(kind, Edges))
-    if conversions and len(kept_kinds) < len(network.further):
-        converted = converted.replace(further=kept_kinds).warn(
+    kept_tables = tuple(table for table in network.further if not isinstance(table, Edges))
+    if conversions and len(kept_tables) < len(network.further):
+        converted = converted.replace(further=kept_tables).warn(
             "edges are dropped: their image points refer to the models before the conversion"
         )
-    dropped = [c.id for c in network.cameras if c.id in conversions and c.sigma]
-    if dropped:
+    dropped_ids = [c.id for c in network.cameras if c.id in conversions and c.sigma]
+    if dropped_ids:
         converted = converted.warn(
-            f"prior σ of the parameters of {', '.join(dropped)} are dropped: they refer to the "
+            f"prior σ of the parameters of {', '.join(dropped_ids)} are dropped: they refer to the "
             "model before the conversion"
         )
     return converted, conversions
@@ -92,8 +87,8 @@ def convert_one(
     camera: Camera, model: str | CameraModel, r0: float = 0.0
 ) -> tuple[Camera, Conversion]:
     """A camera in the model with this name, or a given one, and its `Conversion`."""
-    converted_camera, conversion, _, _ = _convert(camera, model, r0, np.zeros((0, 2)))
-    return converted_camera, conversion
+    converted, conversion, _, _ = _convert(camera, model, r0, np.zeros((0, 2)))
+    return converted, conversion
 
 
 def _convert(
@@ -122,7 +117,7 @@ def _convert(
         size = next((name for name in SIZES if str(error).startswith(name)), None)
         remedy = f"; give --{size.replace('_', '-')} WIDTH,HEIGHT" if size else ""
         raise InputError(f"camera {camera.id!r}: {error}{remedy}") from None
-    converted_camera = dataclasses.replace(
+    converted = dataclasses.replace(
         camera,
         model=model,
         parameters=conversion.parameters,
@@ -131,7 +126,7 @@ def _convert(
         free=_counterparts(camera.free, source, target),
         tie=camera.tie if source == target else (),
     )
-    return converted_camera, conversion, shift - step * centre, step
+    return converted, conversion, shift - step * centre, step
 
 
 def _centre(camera: Camera):
@@ -151,11 +146,11 @@ def _counterparts(free: Sequence[str], source: CameraModel, target: CameraModel)
     counterparts: to or from such a model either all default free parameters are free, or none."""
     if is_own(source) or is_own(target):
         fields = "principal_distance", "principal_point"
-        counterparts = {
+        free_names = {
             n for f in fields if {*getattr(source, f)} & {*free} for n in getattr(target, f)
         }
-        added = {*free} - {*source.core} and {*target.free} - {*target.core}
-        return tuple(name for name in target.parameters if name in counterparts | added)
+        distortion_names = {*free} - {*source.core} and {*target.free} - {*target.core}
+        return tuple(name for name in target.parameters if name in free_names | distortion_names)
     groups: Mapping[str, tuple[str, ...]] = {n: group for group in COUNTERPARTS for n in group}
-    counterparts = {counterpart for name in free for counterpart in groups.get(name, (name,))}
-    return tuple(name for name in target.parameters if name in counterparts)
+    free_names = {counterpart for name in free for counterpart in groups.get(name, (name,))}
+    return tuple(name for name in target.parameters if name in free_names)

@@ -11,13 +11,13 @@ from jaxbundle.network.motions import SIMILARITY
 
 def open_directions_in_words(
     gauge: Float[np.ndarray, "7 defect"],
-    about: Sequence[float] | Float[np.ndarray, "3"] = (0.0, 0.0, 0.0),
+    centre: Sequence[float] | Float[np.ndarray, "3"] = (0.0, 0.0, 0.0),
 ) -> str:
     """Which of shift, rotation and scale the observations leave open, for messages.
 
-    Rotation and scale are about the point `about`: with one point known, no shift is open."""
+    Rotation and scale are about the point `centre`: with one point known, no shift is open."""
     gauge = np.array(gauge)
-    gauge[:3] += np.cross(gauge[3:6].T, about).T + np.outer(about, gauge[6])
+    gauge[:3] += np.cross(gauge[3:6].T, centre).T + np.outer(centre, gauge[6])
     q, _ = np.linalg.qr(gauge / np.linalg.norm(gauge, axis=0)) if gauge.size else (gauge, None)
     parts = [name for name, row in zip(SIMILARITY.names, q) if np.linalg.norm(row) > 0.1]
     words, defect = ", ".join(parts), gauge.shape[1]

@@ -34,7 +34,7 @@ from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.leastsquares.problem import distinct_names
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network.camera_tables import CameraTable, camera_tables
-from jaxbundle.network.kinds.base import present_kinds
+from jaxbundle.network.kinds.base import included_tables
 from jaxbundle.network.kinds.control_points import declare_control_points
 from jaxbundle.network.kinds.distances import declare_distances
 from jaxbundle.network.kinds.exterior_orientation import declare_exterior_orientation
@@ -42,7 +42,7 @@ from jaxbundle.network.kinds.image_points import declare_image_points
 from jaxbundle.network.kinds.interior_orientation import declare_interior_orientation
 from jaxbundle.network.motions import SIMILARITY, SIMILARITY_AT_ANY_DISTANCE
 from jaxbundle.network.tables import EXTERIOR, Network
-from jaxbundle.network.user_observations import place, split_by_type
+from jaxbundle.network.user_observations import place_in_object_space, split_by_type
 from jaxbundle.system.programs import compile_once
 
 # Smallest batch of rotations, so that networks of fewer images share one compiled program:
@@ -95,31 +95,40 @@ def declare(
         *declare_distances(network),
     ]
     # What image points touch is declared even where all of its rows are left out.
-    changing_image_points = [
-        kind.among(network) for kind in network.further if kind.CHANGES_IMAGE_POINTS
+    changing = [
+        table.restrict_to(network) for table in network.further if table.CHANGES_IMAGE_POINTS
     ]
-    other_kinds = [kind for kind in present_kinds(network) if not kind.CHANGES_IMAGE_POINTS]
-    declared = [kind.declare(network, origin) for kind in (*changing_image_points, *other_kinds)]
+    independent = [table for table in included_tables(network) if not table.CHANGES_IMAGE_POINTS]
+    contributions = [table.declare(network, origin) for table in (*changing, *independent)]
     # Observations of users come last, and resolve ids of any table above.
-    user_tables, user_observations = split_by_type(also)
-    further_tables = user_tables + [table for kind in declared for table in kind.tables]
+    user_tables, user_sets = split_by_type(also)
+    further_tables = user_tables + [
+        table for contribution in contributions for table in contribution.tables
+    ]
     tables = [
         _table_of_images(network, origin),
         *(table.unknowns(network.cameras) for table in cameras),
         _table_of_points(network, origin, lengths),
         *further_tables,
     ]
-    other_kinds = [place(kind, origin).resolve_labels(tables) for kind in user_observations]
-    other_kinds += [kind for of_kind in declared for kind in of_kind.observations]
-    observations = distinct_names([*standard, *other_kinds])
+    further_sets = [
+        place_in_object_space(user_set, origin).resolve_labels(tables) for user_set in user_sets
+    ]
+    further_sets += [
+        further_set for contribution in contributions for further_set in contribution.observations
+    ]
+    observations = distinct_names([*standard, *further_sets])
     similarity = SIMILARITY if lengths is None else SIMILARITY_AT_ANY_DISTANCE
-    actions = (*similarity.actions, *(action for kind in declared for action in kind.actions))
+    actions = (
+        *similarity.actions,
+        *(action for contribution in contributions for action in contribution.actions),
+    )
     return DeclaredNetwork(
         tuple(tables),
         observations,
         cameras,
         image_rows,
-        tuple(kind.name for kind in observations[len(standard) :]),
+        tuple(further_set.name for further_set in observations[len(standard) :]),
         tuple(table.name for table in further_tables),
         origin,
         lengths,
@@ -164,8 +173,8 @@ def order_cameras(network: Network) -> Network:
 
 def _quaternions(angles: Float[np.ndarray, "images 3"]) -> Float[np.ndarray, "images 4"]:
     """Rotations, by a program shared by small networks."""
-    wide = np.resize(angles, (max(round_up(len(angles)), LEAST_IMAGES), 3))
-    return np.asarray(_quaternions_of(wide))[: len(angles)]
+    padded = np.resize(angles, (max(round_up(len(angles)), LEAST_IMAGES), 3))
+    return np.asarray(_quaternions_of(padded))[: len(angles)]
 
 
 _quaternions_of = compile_once(jax.vmap(quaternion_from_omega_phi_kappa), ())

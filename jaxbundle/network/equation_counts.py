@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.kinds.base import present_kinds, rows_of
+from jaxbundle.network.kinds.base import included_tables, rows_of
 from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import (
     EXTERIOR,
@@ -25,14 +25,14 @@ def count_controlled_axes(points: Points) -> Int[np.ndarray, " points"]:
     return np.where(points.has_role("fixed"), 3, np.where(points.has_role("control"), axes, 0))
 
 
-def equations_of(network: Network, table_name: str) -> Int[np.ndarray, " things"]:
+def equations_of(network: Network, object_type: str) -> Int[np.ndarray, " things"]:
     """The number of equations of further kinds that touch every image ("IMAGES") or point
     ("POINTS")."""
-    table = network.images if table_name == "IMAGES" else network.points
-    number = np.zeros(len(table), int)
-    for kind in present_kinds(network):
-        for field in getattr(kind, table_name):
-            np.add.at(number, rows_of(getattr(kind, field), table), kind.number_of_equations())
+    objects = network.images if object_type == "IMAGES" else network.points
+    number = np.zeros(len(objects), int)
+    for table in included_tables(network):
+        for field in getattr(table, object_type):
+            np.add.at(number, rows_of(getattr(table, field), objects), table.number_of_equations())
     return number
 
 
@@ -43,61 +43,65 @@ def leave_out_with_too_few_rays(network: Network) -> Network:
     **Raises:** `InputError` or `NotSolvedError` if that is half of the images or more."""
     points, images, distances = network.points, network.images, network.distances
     image, point = network.observations.image, network.observations.point
-    fixed, check = points.has_role("fixed"), points.has_role("check")
-    known_coordinates = count_controlled_axes(points) + equations_of(network, "POINTS")
-    priors_of_image = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
-    keep, is_used = np.ones(len(points), bool), np.ones(len(images), bool)
+    is_fixed, is_check = points.has_role("fixed"), points.has_role("check")
+    point_equations = count_controlled_axes(points) + equations_of(network, "POINTS")
+    image_equations = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
+    points_kept, images_kept = np.ones(len(points), bool), np.ones(len(images), bool)
     # Points and images depend on each other: without a point an image may have too few, without the
     # image other points lose a ray. Everything is counted again until nothing changes.
-    first_reason = None
+    first_error = None
     while True:
-        rays = np.bincount(point[is_used[image]], minlength=len(points))
-        ends = distances.points[keep[distances.points].all(1)]
-        distances_of_point = np.bincount(ends.ravel(), minlength=len(points))
-        determined = fixed | (2 * rays + distances_of_point + known_coordinates >= 3)
+        rays = np.bincount(point[images_kept[image]], minlength=len(points))
+        ends = distances.points[points_kept[distances.points].all(1)]
+        distance_counts = np.bincount(ends.ravel(), minlength=len(points))
+        determined = is_fixed | (2 * rays + distance_counts + point_equations >= 3)
         # Fixed points that no image sees add nothing, nor do images without points, whatever is
         # known of them.
-        keep_now = keep & np.where(check, rays >= 2, (rays + distances_of_point > 0) & determined)
-        taking_part = (keep_now & ~check)[point]
-        points_of_image = np.bincount(image[taking_part], minlength=len(images))
-        used_now = is_used & (points_of_image > 0) & (2 * points_of_image + priors_of_image >= 6)
-        if (keep_now == keep).all() and (used_now == is_used).all():
+        next_points_kept = points_kept & np.where(
+            is_check, rays >= 2, (rays + distance_counts > 0) & determined
+        )
+        taking_part = (next_points_kept & ~is_check)[point]
+        point_counts = np.bincount(image[taking_part], minlength=len(images))
+        next_images_kept = (
+            images_kept & (point_counts > 0) & (2 * point_counts + image_equations >= 6)
+        )
+        if (next_points_kept == points_kept).all() and (next_images_kept == images_kept).all():
             break
         # Only the first image: those that follow are left out because of it.
-        if first_reason is None and (used_now != is_used).any():
+        if first_error is None and (next_images_kept != images_kept).any():
             measured = np.bincount(image, minlength=len(images))
-            worst = int(np.where(used_now, np.inf, measured).argmin())
-            first_reason = _too_few_points(network, worst, points_of_image)
-        keep, is_used = keep_now, used_now
+            worst = int(np.where(next_images_kept, np.inf, measured).argmin())
+            first_error = _too_few_points(network, worst, point_counts)
+        points_kept, images_kept = next_points_kept, next_images_kept
     # So many say that something is wrong with the network, not with these images.
-    if first_reason is not None and 2 * (~is_used).sum() >= len(images):
-        raise first_reason
-    out, notes = ~keep, []
+    if first_error is not None and 2 * (~images_kept).sum() >= len(images):
+        raise first_error
+    left_out, notes = ~points_kept, []
     for mask, noun, why in (
-        (out & ~check & (rays == 0), "point", "without any ray"),
-        (out & ~check & (rays > 0), "tie point", "with a single ray"),
-        (out & check, "check point", "with fewer than two rays"),
+        (left_out & ~is_check & (rays == 0), "point", "without any ray"),
+        (left_out & ~is_check & (rays > 0), "tie point", "with a single ray"),
+        (left_out & is_check, "check point", "with fewer than two rays"),
     ):
         notes.append((noun, [points.id[row] for row in np.flatnonzero(mask)], why))
-    names = [images.id[row] for row in np.flatnonzero(~is_used)]
+    names = [images.id[row] for row in np.flatnonzero(~images_kept)]
     notes.append(("image", names, "with too few points that other images or control determine"))
-    remaining = keep_images(keep_points(network, keep), is_used)
-    for noun, missing_names, why in notes:
-        remaining = record_left_out(remaining, noun, missing_names, why, measured=noun == "image")
+    remaining = keep_images(keep_points(network, points_kept), images_kept)
+    for noun, ids, why in notes:
+        remaining = record_left_out(remaining, noun, ids, why, measured=noun == "image")
     messages = []
-    for kind in network.further:
-        number_of_rows = len(kind) - len(kind.among(remaining))
-        if number_of_rows:
+    for table in network.further:
+        lost_rows = len(table) - len(table.restrict_to(remaining))
+        if lost_rows:
             messages.append(
-                f"{kind.TABLE}: left out {count(number_of_rows, 'row')} about excluded objects"
+                f"{table.TABLE}: left out {count(lost_rows, 'row')} about excluded objects"
             )
-    number_of_distances = (~keep[distances.points].all(1)).sum()
-    if number_of_distances:
+    lost_distances = (~points_kept[distances.points].all(1)).sum()
+    if lost_distances:
         messages.append(
-            f"left out {count(number_of_distances, 'distance')} to a point that was left out"
+            f"left out {count(lost_distances, 'distance')} to a point that was left out"
         )
     remaining = remaining.note(*messages)
-    if network.datum_points and not keep[np.isin(points.id, network.datum_points)].any():
+    if network.datum_points and not points_kept[np.isin(points.id, network.datum_points)].any():
         reasons = remaining.notes[len(network.notes) :]
         raise InputError(
             f"datum_points: none is left ({'; '.join(reasons)}); name points with two rays"
@@ -112,26 +116,25 @@ def _too_few_points(
     images, points, rays = network.images, network.points, network.observations
     rays_of_point = np.bincount(rays.point, minlength=len(points))
     place = f"{images.source(row)}: image {images.id[row]!r}: "
-    points_of_image = rays.point[rays.image == row]
-    if not len(points_of_image):
+    measured_points = rays.point[rays.image == row]
+    if not len(measured_points):
         return InputError(f"{place}an image with no rays; measure points in it or remove the image")
-    points_with_one_ray = [
-        points.id[p] for p in points_of_image if rays_of_point[p] == 1 and points.role[p] == "tie"
+    single_ray_points = [
+        points.id[p] for p in measured_points if rays_of_point[p] == 1 and points.role[p] == "tie"
     ]
-    if len(points_of_image) >= 3 and points_with_one_ray:
+    if len(measured_points) >= 3 and single_ray_points:
         return NotSolvedError(
             f"{place}not solved: it shares too few points with other images, so that neither "
             f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
-            f"{list_some(points_with_one_ray)} can be determined; add images of the same points, "
-            "or "
+            f"{list_some(single_ray_points)} can be determined; add images of the same points, or "
             "control points",
             [f"{name} of image {images.id[row]}" for name in EXTERIOR]
-            + [f"X, Y, Z of point {id}" for id in points_with_one_ray],
+            + [f"X, Y, Z of point {id}" for id in single_ray_points],
         )
     part = (
         ""
-        if usable[row] == len(points_of_image)
-        else f" of the {len(points_of_image)} measured ones"
+        if usable[row] == len(measured_points)
+        else f" of the {len(measured_points)} measured ones"
     )
     why = "" if not part else " (the others are check points or seen in one image only)"
     return InputError(
@@ -144,12 +147,10 @@ def check_parts(network: Network) -> None:
     """Refuse parts of the network that are neither connected nor positioned."""
     images, points, rays = network.images, network.points, network.observations
     is_known = count_controlled_axes(points) == 3
-    tie_rays = ~(is_known | points.has_role("check"))[rays.point]
+    ties = ~(is_known | points.has_role("check"))[rays.point]
     # Only tie points connect: known ones have their coordinates in each part, and check points
     # take no part in the adjustment.
-    part = label_connected_parts(
-        rays.image[tie_rays], rays.point[tie_rays], len(images), len(points)
-    )
+    part = label_connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
     labels, part = np.unique(part, return_inverse=True)
     if len(labels) == 1:
         return
@@ -159,10 +160,10 @@ def check_parts(network: Network) -> None:
     known_points = np.bincount(known_in_part[0], minlength=len(labels))
     priors = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
     priors = np.bincount(part, priors, minlength=len(labels))
-    loose = np.flatnonzero((known_points < 3) & (priors < 6))
-    if len(loose):
+    loose_parts = np.flatnonzero((known_points < 3) & (priors < 6))
+    if len(loose_parts):
         size = np.bincount(part)
-        smallest = loose[size[loose].argmin()]
+        smallest = loose_parts[size[loose_parts].argmin()]
         names = [id for id, p in zip(images.id, part) if p == smallest]
         raise InputError(
             f"{images.source.name}: the network consists of {len(labels)} parts without common tie "
@@ -184,13 +185,13 @@ def label_connected_parts(
     while True:
         of_point = np.full(points, images)
         np.minimum.at(of_point, point, label[image])
-        new = label.copy()
-        np.minimum.at(new, image, of_point[point])
-        np.minimum.at(new, label[image], of_point[point])
-        new = new[new]
-        if (new == label).all():
+        next_label = label.copy()
+        np.minimum.at(next_label, image, of_point[point])
+        np.minimum.at(next_label, label[image], of_point[point])
+        next_label = next_label[next_label]
+        if (next_label == label).all():
             return label
-        label = new
+        label = next_label
 
 
 def check_redundancy(network: Network) -> None:
@@ -220,14 +221,14 @@ def check_redundancy(network: Network) -> None:
     # problem has been made, and a count says what is missing in numbers that a reader can check.
     conditions = 0
     if network.datum != "control":
-        known_numbers = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
-        conditions = max(0, 7 - known_numbers - (len(network.distances) > 0))
-    number_missing = unknowns - rows - conditions
-    if number_missing > 0:
+        datum_values = count_controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
+        conditions = max(0, 7 - datum_values - (len(network.distances) > 0))
+    missing_equations = unknowns - rows - conditions
+    if missing_equations > 0:
         with_datum = f" with {conditions} datum conditions" if conditions else ""
         raise InputError(
             f"{network.observations.source.name}: {rows} observations{with_datum} are too few "
-            f"for {unknowns} unknowns: {number_missing} missing; measure more points, free fewer "
-            "camera "
+            f"for {unknowns} unknowns: {missing_equations} missing; measure more points, free "
+            "fewer camera "
             "parameters" + ("" if conditions else ', or, without control, set datum = "inner"')
         )

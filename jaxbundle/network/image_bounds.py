@@ -40,17 +40,15 @@ def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) 
         if network is None:
             continue
         rays, images = network.observations, network.images
-        rows_of_camera = np.flatnonzero(images.camera[rays.image] == c)
-        rows_outside = rows_of_camera[is_outside(camera, rays.xy[rows_of_camera])]
+        rows = np.flatnonzero(images.camera[rays.image] == c)
+        rows_outside = rows[is_outside(camera, rays.xy[rows])]
         if len(rows_outside):
             x, y = rays.xy[rows_outside[0]]
             warnings.append(
-                f"{where}{len(rows_outside)} of {count(len(rows_of_camera), 'image point')} "
-                "outside the image of "
-                f"{size[0]} × {size[1]} pixels, such as point "
+                f"{where}{len(rows_outside)} of {count(len(rows), 'image point')} outside the "
+                f"image of {size[0]} × {size[1]} pixels, such as point "
                 f"{network.points.id[rays.point[rows_outside[0]]]!r} of image "
                 f"{images.id[rays.image[rows_outside[0]]]!r} at ({x:.6g}, {y:.6g}) {model.unit} "
-                "from the "
-                f"{origin}; check the origin of the coordinates and the image size"
+                f"from the {origin}; check the origin of the coordinates and the image size"
             )
     return tuple(warnings)

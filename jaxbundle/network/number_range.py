@@ -43,11 +43,11 @@ def check_coordinates(
     # Equal coordinates may be poor start values, or all that is left of others.
     if step <= noticed_step * extent or extent == 0 and step < refused_step:
         return network
-    finding = (
+    message = (
         f"coordinates of {largest:.3g} are held in steps of {step:.2g} {network.object_unit}, and "
         f"the network is {extent:.3g} {network.object_unit} wide: subtract a common offset from "
         "all of them"
     )
     if step > refused_step * extent:
-        raise InputError(f"{network.points.source.name}: {finding}")
-    return network.warn(finding)
+        raise InputError(f"{network.points.source.name}: {message}")
+    return network.warn(message)

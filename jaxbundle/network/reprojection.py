@@ -63,17 +63,17 @@ def _project(
     portion = 4096
     with local_x64():
         for begin in range(0, len(rows), portion):
-            rows_of_portion = rows[begin : begin + portion]
-            padded = np.pad(rows_of_portion, (0, portion - len(rows_of_portion)), mode="edge")
-            image = rays.image[padded]
+            portion_rows = rows[begin : begin + portion]
+            padded_rows = np.pad(portion_rows, (0, portion - len(portion_rows)), mode="edge")
+            image = rays.image[padded_rows]
             part = _portion(
                 model,
                 values[images.camera[image]],
                 images.position[image],
                 images.angles[image],
-                network.points.position[rays.point[padded]],
+                network.points.position[rays.point[padded_rows]],
             )
-            projected[begin : begin + portion] = np.asarray(part)[: len(rows_of_portion)]
+            projected[begin : begin + portion] = np.asarray(part)[: len(portion_rows)]
     return projected
 
 

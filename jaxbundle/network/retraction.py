@@ -31,11 +31,11 @@ class TurnAboutSeen:
     declared: Declared
 
     def __call__(self, plan: Plan, values: Values, change: Tangent) -> Values:
-        moved_values = retract(self.declared, plan, values, change)
+        retracted = retract(self.declared, plan, values, change)
         changes = changes_of_tables(plan, values, change)
         if "image" not in changes:
-            return moved_values
-        old, new, pivot = values["image"], moved_values["image"], self._middle(plan, values)
+            return retracted
+        old, new, pivot = values["image"], retracted["image"], self._middle(plan, values)
 
         def position(
             old: Float[Array, "3"],
@@ -54,14 +54,12 @@ class TurnAboutSeen:
             old.position, matrices(old.rotation), matrices(new.rotation), changes["image"], pivot
         )
         free = plan.groups["image"].free[:, :3].all(1, keepdims=True)
-        return moved_values | {
-            "image": PoseValue(jnp.where(free, turned, new.position), new.rotation)
-        }
+        return retracted | {"image": PoseValue(jnp.where(free, turned, new.position), new.rotation)}
 
     def _middle(self, plan: Plan, values: Values) -> Float[Array, "images 3"]:
         """The centre of the points that each image sees; 0 if it sees none."""
         position, points = values["image"].position, values["point"][:, :3]
-        weighted_sums = jnp.zeros((position.shape[0], 4))
+        sums = jnp.zeros((position.shape[0], 4))
         for part in plan.parts:
             if not isinstance(self.declared.kinds[part.set_name].residual, ImagePoint):
                 continue
@@ -69,14 +67,12 @@ class TurnAboutSeen:
             centre = position[image] if part.by_row[0] else position[image][:, None]
             point = point if part.by_row[-1] else point[:, None]
             # The last row of the source is that of the padding.
-            is_used = part.source != part.place.shape[0] - 1
+            is_observation = part.source != part.place.shape[0] - 1
             square = jnp.sum((point - centre) ** 2, -1)
-            weight = jnp.where(is_used, 1 / jnp.maximum(square, 1e-300), 0.0)[..., None]
+            weight = jnp.where(is_observation, 1 / jnp.maximum(square, 1e-300), 0.0)[..., None]
             rows = jnp.concatenate([weight * point, weight], -1)
             rows = rows if part.by_row[0] else rows.sum(1)
             rows = rows.reshape(-1, 4)
-            weighted_sums = weighted_sums + jax.ops.segment_sum(
-                rows, image.ravel(), position.shape[0]
-            )
-        weighted_sums = sum_over_devices(plan, weighted_sums)
-        return weighted_sums[:, :3] / jnp.where(weighted_sums[:, 3:] > 0, weighted_sums[:, 3:], 1.0)
+            sums = sums + jax.ops.segment_sum(rows, image.ravel(), position.shape[0])
+        sums = sum_over_devices(plan, sums)
+        return sums[:, :3] / jnp.where(sums[:, 3:] > 0, sums[:, 3:], 1.0)

@@ -42,11 +42,11 @@ def check_unique(ids: Sequence[str], source: Source, noun: str) -> None:
     """Refuse an id that occurs in two rows of a table."""
     if len(set(ids)) == len(ids):
         return
-    first_row: dict[str, int] = {}
+    first_rows: dict[str, int] = {}
     for row, id in enumerate(ids):
-        if first_row.setdefault(id, row) != row:
+        if first_rows.setdefault(id, row) != row:
             raise InputError(
-                f"{source(row)}: {noun} {id!r} is already in {source(first_row[id])}; "
+                f"{source(row)}: {noun} {id!r} is already in {source(first_rows[id])}; "
                 "an id must be unique"
             )
 
@@ -71,13 +71,12 @@ def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
 def check_models(cameras: Sequence[Camera], where: str = "") -> None:
     """Refuse two different models with the same name: files and reports could not distinguish
     them."""
-    first_camera: dict[str, Camera] = {}
+    first_of_name: dict[str, Camera] = {}
     for camera in cameras:
-        earlier_camera = first_camera.setdefault(str(camera.model), camera)
-        if earlier_camera.model != camera.model:
+        first_camera = first_of_name.setdefault(str(camera.model), camera)
+        if first_camera.model != camera.model:
             raise InputError(
-                f"{where}cameras {earlier_camera.id!r} and {camera.id!r} have different models "
-                "named "
+                f"{where}cameras {first_camera.id!r} and {camera.id!r} have different models named "
                 f"{str(camera.model)!r}; rename one of them, or give both the same object"
             )
 
@@ -114,7 +113,7 @@ def check_camera(camera: Camera, where: str = "") -> None:
                 f"{where}sigma is given for {name!r}, which is not free; add it to free, or remove "
                 f"its sigma (free: {', '.join(camera.free) or 'none'})"
             )
-        if not _positive(sigma):
+        if not _is_positive(sigma):
             raise InputError(f"{where}sigma of {name} is {sigma}; it must be finite and positive")
     for name, value in camera.observed.items():
         if name not in camera.sigma:
@@ -134,10 +133,11 @@ def _check_fields(camera: Camera, where: str) -> None:
     if not isinstance(camera.model, str | CameraModel):
         raise InputError(f"{where}model is {show(camera.model)}; expected a name or a CameraModel")
     for field in ("parameters", "sigma", "observed"):
-        values = getattr(camera, field)
-        if not isinstance(values, Mapping):
+        field_value = getattr(camera, field)
+        if not isinstance(field_value, Mapping):
             raise InputError(
-                f"{where}{field} is {show(values)}; expected numbers by name, such as {{'c': 20.0}}"
+                f"{where}{field} is {show(field_value)}; expected numbers by name, such as "
+                "{'c': 20.0}"
             )
     if not _are_names(camera.free):
         raise InputError(
@@ -149,8 +149,8 @@ def _check_fields(camera: Camera, where: str) -> None:
         )
 
 
-def _are_names(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
+def _are_names(names: Any) -> bool:
+    return isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
 
 
 def _check_ties(camera: Camera, values: Mapping[str, float], where: str) -> None:
@@ -176,7 +176,7 @@ def _check_ties(camera: Camera, values: Mapping[str, float], where: str) -> None
 def _check_pair(where: str, name: str, pair: Any, meaning: str) -> None:
     # The number under a mask is no size.
     numbers = np.shape(pair) == (2,) and not isinstance(pair, np.ma.MaskedArray)
-    if pair is not None and not (numbers and all(map(_positive, pair))):
+    if pair is not None and not (numbers and all(map(_is_positive, pair))):
         raise InputError(f"{where}{name} is {show(pair)}; expected {meaning}, both positive")
 
 
@@ -184,11 +184,11 @@ def check_sigma_image(sigma: float, where: str = "") -> None:
     """Refuse a default σ of image coordinates that is not finite and positive."""
     if isinstance(sigma, bool) or not isinstance(sigma, int | float | np.number):
         raise InputError(f"{where}sigma_image is {show(sigma)}; expected a number")
-    if not _positive(sigma):
+    if not _is_positive(sigma):
         raise InputError(f"{where}sigma_image is {show(sigma)}; it must be finite and positive")
 
 
-def _positive(value: Any) -> bool:
+def _is_positive(value: Any) -> bool:
     try:
         return math.isfinite(value) and value > 0
     except (OverflowError, TypeError):

@@ -23,31 +23,28 @@ def check_single_strip(network: Network, max_roll_sigma: float = 1.0) -> Network
     """
     images, points = network.images, network.points
     sigma = images.sigma[:, :3]
-    has_position = np.isfinite(sigma).all(1)
+    has_sigma = np.isfinite(sigma).all(1)
     is_known = points.has_role("control") | points.has_role("fixed")
-    has_other_orientation = np.isfinite(images.sigma[:, 3:]).any() or is_known.any()
-    if network.datum != "control" or has_other_orientation or has_position.sum() < 2:
+    has_other_datum = np.isfinite(images.sigma[:, 3:]).any() or is_known.any()
+    if network.datum != "control" or has_other_datum or has_sigma.sum() < 2:
         return network
-    centres = images.position[has_position] - images.position[has_position].mean(0)
+    centres = images.position[has_sigma] - images.position[has_sigma].mean(0)
     _, extents, axes = np.linalg.svd(centres)
-    distance = np.linalg.norm(centres - np.outer(centres @ axes[0], axes[0]), axis=1)
-    if np.isfinite(images.sigma[~has_position, :3]).any() or not extents[0] > 0:
+    offsets = np.linalg.norm(centres - np.outer(centres @ axes[0], axes[0]), axis=1)
+    if np.isfinite(images.sigma[~has_sigma, :3]).any() or not extents[0] > 0:
         return network
-    where = (
-        f"{images.source.name}: the {has_position.sum()} projection centres with σ lie on one line"
-    )
+    where = f"{images.source.name}: the {has_sigma.sum()} projection centres with σ lie on one line"
     # Coordinates with seven digits that lie on a line do so to their rounding.
-    if distance.max() < 1e-7 * extents[0]:
+    if offsets.max() < 1e-7 * extents[0]:
         raise InputError(
             f"{where} and nothing else fixes the datum: the rotation about the axis of the strip "
             f'(its roll) is not determined; {REMEDY}, or choose datum = "inner" or "minimal"'
         )
-    extent_across = float(np.sqrt((distance**2).sum()))
-    roll = float(np.degrees(np.sqrt(np.mean(sigma[has_position] ** 2)) / extent_across))
+    offset_norm = float(np.sqrt((offsets**2).sum()))
+    roll = float(np.degrees(np.sqrt(np.mean(sigma[has_sigma] ** 2)) / offset_norm))
     if roll > max_roll_sigma:
         return network.warn(
-            f"{where} but for {distance.max():.2g} {network.object_unit}: the rotation about the "
-            "axis "
-            f"of the strip (its roll) is known only to about {roll:.2g}°; {REMEDY}"
+            f"{where} but for {offsets.max():.2g} {network.object_unit}: the rotation about the "
+            f"axis of the strip (its roll) is known only to about {roll:.2g}°; {REMEDY}"
         )
     return network

@@ -40,12 +40,12 @@ def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
     index = np.cumsum(keep) - 1
     observations = network.observations.take(keep[network.observations.point])
     network = keep_distances(network, np.all(keep[network.distances.points], axis=1))
-    dropped = {id for id, is_kept in zip(network.points.id, keep) if not is_kept}
+    dropped_ids = {id for id, is_kept in zip(network.points.id, keep) if not is_kept}
     return network.replace(
         points=network.points.take(keep),
         observations=dataclasses.replace(observations, point=index[observations.point]),
         distances=dataclasses.replace(network.distances, points=index[network.distances.points]),
-        datum_points=tuple(id for id in network.datum_points if id not in dropped),
+        datum_points=tuple(id for id in network.datum_points if id not in dropped_ids),
     )
 
 

@@ -86,12 +86,12 @@ def _obj(content: bytes) -> Mesh:
             indices = [int(word.split("/")[0]) for word in words]
             # Counted from 1, or backwards from the last.
             faces.append([k - 1 if k > 0 else len(vertices) + k for k in indices])
-    return Mesh(np.array(vertices, float).reshape(-1, 3), _fans(faces))
+    return Mesh(np.array(vertices, float).reshape(-1, 3), _triangulate(faces))
 
 
-def _fans(faces: list) -> Int[np.ndarray, "m 3"]:
-    fans = [(f[0], b, c) for f in faces for b, c in zip(f[1:], f[2:])]
-    return np.array(fans, np.int64).reshape(-1, 3)
+def _triangulate(faces: list) -> Int[np.ndarray, "m 3"]:
+    triangles = [(f[0], b, c) for f in faces for b, c in zip(f[1:], f[2:])]
+    return np.array(triangles, np.int64).reshape(-1, 3)
 
 
 def _ply(content: bytes) -> Mesh:
@@ -111,10 +111,10 @@ def _ply(content: bytes) -> Mesh:
         if not 0 <= number <= len(body) or not properties:
             raise ValueError(f"{number} elements {name!r} are not in a file of this length")
         types = [order + PLY_TYPES[p[0]] for p in properties if p[0] != "list"]
-        plain = len(types) == len(properties)
+        has_no_list = len(types) == len(properties)
         if texts is not None:
             rows = [[_text_value(texts, p) for p in properties] for _ in range(number)]
-        elif plain:
+        elif has_no_list:
             dtype = np.dtype([(f"f{k}", t) for k, t in enumerate(types)])
             rows = [list(row) for row in np.frombuffer(body, dtype, number, offset).tolist()]
             offset += number * dtype.itemsize
@@ -127,7 +127,7 @@ def _ply(content: bytes) -> Mesh:
         elif name == "face":
             k = next(k for k, p in enumerate(properties) if p[-1].startswith("vertex_ind"))
             faces = [row[k] for row in rows]
-    return Mesh(vertices, _fans(faces))
+    return Mesh(vertices, _triangulate(faces))
 
 
 def _text_value(texts: Iterator[bytes], property: list[str]) -> float | list[int]:
@@ -168,8 +168,8 @@ def read_grid(path: str | Path) -> TerrainGrid:
 
 @lru_cache(maxsize=4)
 def _read_grid(path: str, _: int) -> TerrainGrid:
-    model = read_heights(path)
-    return TerrainGrid(model.heights, model.origin, model.step)
+    raster = read_heights(path)
+    return TerrainGrid(raster.heights, raster.origin, raster.step)
 
 
 def surface_near(
@@ -180,15 +180,15 @@ def surface_near(
     or over a void.
 
     The surface is `{plane, normal}`, `{mesh}` or `{dem}`: a mesh and a grid as files or arrays."""
-    nowhere = np.zeros(len(X), bool)
+    is_outside = np.zeros(len(X), bool)
     if "plane" in surface:
         normal = np.array(surface["normal"], float) / np.linalg.norm(surface["normal"])
         place = np.array(surface["plane"], float) - origin
-        return (np.tile(place, (len(X), 1)), np.tile(normal, (len(X), 1))), nowhere
+        return (np.tile(place, (len(X), 1)), np.tile(normal, (len(X), 1))), is_outside
     if "mesh" in surface:
         mesh = surface["mesh"]
         mesh = read_mesh(mesh) if isinstance(mesh, str) else Mesh(*map(np.asarray, mesh))
-        return (triangles_near(mesh, X) - origin,), nowhere
+        return (triangles_near(mesh, X) - origin,), is_outside
     grid = surface["dem"]
     grid = read_grid(grid) if isinstance(grid, str) else TerrainGrid(*grid)
     heights, first_node = heights_near(grid, X)
@@ -221,11 +221,11 @@ def triangles_near(
     """The corners of the triangles nearest to points."""
     corners = mesh.vertices[mesh.triangles]
     middle = corners.mean(1)
-    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(1)
+    radius = np.linalg.norm(corners - middle[:, None], axis=2).max(1)
     nearest_triangles = []
     for P in X:
-        bound = np.linalg.norm(middle - P, axis=1) - reach
-        candidates = np.argpartition(bound, min(BOUNDED, len(bound)) - 1)[:BOUNDED]
+        lower_bound = np.linalg.norm(middle - P, axis=1) - radius
+        candidates = np.argpartition(lower_bound, min(BOUNDED, len(lower_bound)) - 1)[:BOUNDED]
         nearest = candidates[
             np.argsort(squared_distances_to_triangles(P, corners[candidates], np))[:CANDIDATES]
         ]
@@ -243,8 +243,8 @@ def heights_near(
     padded = np.pad(grid.heights, REACH, constant_values=np.nan)
     cell = np.floor((X[:, :2] - grid.origin) / grid.step).astype(int)
     shape = np.array(grid.heights.shape[::-1])
-    inside_cell = np.clip(cell, -1, shape - 1)
-    parts, first_column_and_row = [], inside_cell - REACH + 1
-    for column, row in inside_cell + 1:
+    clipped_cell = np.clip(cell, -1, shape - 1)
+    parts, first_node = [], clipped_cell - REACH + 1
+    for column, row in clipped_cell + 1:
         parts.append(padded[row : row + 2 * REACH, column : column + 2 * REACH])
-    return np.array(parts), np.array(grid.origin) + first_column_and_row * np.array(grid.step)
+    return np.array(parts), np.array(grid.origin) + first_node * np.array(grid.step)

@@ -98,8 +98,8 @@ class Camera:
     def unknowns(self) -> tuple[str, ...]:
         """The names of the free parameters; of tied ones the first."""
         # A group is one unknown: freeing any of it frees all.
-        first_of_group = {name: group[0] for group in self.tie for name in group}
-        return tuple(dict.fromkeys(first_of_group.get(name, name) for name in self.free))
+        representative = {name: group[0] for group in self.tie for name in group}
+        return tuple(dict.fromkeys(representative.get(name, name) for name in self.free))
 
 
 def units_of(cameras: Iterable[Camera]) -> str:
@@ -184,8 +184,8 @@ class Points:
 
     def with_colours(self, colours: Mapping[str, Sequence[int]]) -> "Points":
         """The same points with the colours of some, by id; the others are `GREY`."""
-        colour_of_points = [tuple(colours.get(id, GREY)) for id in self.id]
-        return dataclasses.replace(self, colour=np.array(colour_of_points, np.uint8).reshape(-1, 3))
+        colour_of_point = [tuple(colours.get(id, GREY)) for id in self.id]
+        return dataclasses.replace(self, colour=np.array(colour_of_point, np.uint8).reshape(-1, 3))
 
     def has_role(self, *roles: str) -> Bool[np.ndarray, " points"]:
         """Which points have one of these roles."""

@@ -98,16 +98,16 @@ def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray,
     rows = [k for k, id in enumerate(network.images.id) if id in images]
     if not rows:
         return ""
-    distance_at_start = np.linalg.norm(network.images.position[rows], axis=1)
+    start_distance = np.linalg.norm(network.images.position[rows], axis=1)
     adjusted_distance = np.linalg.norm([images[network.images.id[k]] for k in rows], axis=1)
     # Start values that are wrong in their unit only are good to a tenth; poor ones are not 1000
     # times too small all together.
     with np.errstate(divide="ignore", invalid="ignore"):
-        decades = np.abs(np.log10(adjusted_distance / distance_at_start))
+        decades = np.abs(np.log10(adjusted_distance / start_distance))
     if not (np.abs(decades - 3) < np.log10(1.1)).all():
         return ""
     return (
-        f"the adjusted projection centres are {adjusted_distance[0] / distance_at_start[0]:.4g} "
+        f"the adjusted projection centres are {adjusted_distance[0] / start_distance[0]:.4g} "
         "times their start values: "
         f"is the control in mm, or the start values in m? Expected is one unit of object "
         f"coordinates, {network.object_unit}"
@@ -120,21 +120,25 @@ def _check_field(camera: Camera, xy: Float[np.ndarray, "rays 2"]) -> str:
     values = [camera.parameters[name] for name in model.principal_distance]
     name, c = model.principal_distance[0], min(float(value) for value in values)
     point = [camera.parameters.get(n, 0.0) for n in model.principal_point] or [0.0, 0.0]
-    usual = float(np.median(np.hypot(*(xy - point).T)))
+    median_radius = float(np.median(np.hypot(*(xy - point).T)))
     size = camera.pixel_size
-    if usual > LIMITS.max_radius * c:
+    if median_radius > LIMITS.max_radius * c:
         raise InputError(
             f"camera {camera.id!r}: {name} is {c:g} {model.unit} and half of its image points lie "
-            f"more than {usual:.4g} {model.unit} from the principal point, "
-            f"{np.degrees(np.arctan(usual / c)):.1f}° from the axis: no lens has such a field of "
-            "view. "
-            f"{_remedy(camera, model.unit, name, c, usual)}"
+            f"more than {median_radius:.4g} {model.unit} from the principal point, "
+            f"{np.degrees(np.arctan(median_radius / c)):.1f}° from the axis: no lens has such a "
+            "field of view. "
+            f"{_remedy(camera, model.unit, name, c, median_radius)}"
         )
-    if size is not None and max(size) < LIMITS.fine_pixel and usual < LIMITS.narrow_radius * c:
+    if (
+        size is not None
+        and max(size) < LIMITS.fine_pixel
+        and median_radius < LIMITS.narrow_radius * c
+    ):
         return (
             f"camera {camera.id!r}: pixel_size is {max(size):g} mm, and half of its image points "
-            f"lie within {usual / c:.2g} of {name} about the axis; is it in metres? It is expected "
-            f"in mm ({1000 * max(size):g})"
+            f"lie within {median_radius / c:.2g} of {name} about the axis; is it in metres? It "
+            f"is expected in mm ({1000 * max(size):g})"
         )
     if size is not None or camera.image_size is not None:
         return _in_pixels(camera, xy)
@@ -159,8 +163,7 @@ def name_degrees(points: Points) -> str:
         return ""
     return (
         f"X and Y of the {count(int(is_known.sum()), 'known point')} look like longitude and "
-        "latitude "
-        f"in degrees (X {low[0]:.8g} to {high[0]:.8g}, Y {low[1]:.8g} to {high[1]:.8g}, Z "
+        f"latitude in degrees (X {low[0]:.8g} to {high[0]:.8g}, Y {low[1]:.8g} to {high[1]:.8g}, Z "
         f"{low[2]:.4g} to {high[2]:.4g}): expected coordinates in one unit of length; convert "
         "them to a map projection, such as UTM, or to a local system"
     )
@@ -178,26 +181,21 @@ def name_sigma_unit(network: Network, sigma0: float) -> str:
     if network.image_unit == "px" and unit == "mm" and pitch:  # Converted where it was read.
         unit, sigma = "px", sigma / pitch
     if unit == "mm":
-        factor_of_unit = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
+        factors = {"µm": 1e-3} | ({"pixels": pitch} if pitch else {})
         if sigma < LIMITS.min_sigma * (pitch or LIMITS.min_pixel):
-            factor_of_unit["m"] = 1e3
+            factors["m"] = 1e3
     else:
-        factor_of_unit = (
-            {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < LIMITS.min_sigma else {}
-        )
-    possible_units = {
-        u: f
-        for u, f in factor_of_unit.items()
-        if 1 / LIMITS.agreement < sigma0 / f < LIMITS.agreement
+        factors = {"mm": 1 / pitch} if pitch else {"mm": sigma0} if sigma < LIMITS.min_sigma else {}
+    plausible_factors = {
+        u: f for u, f in factors.items() if 1 / LIMITS.agreement < sigma0 / f < LIMITS.agreement
     }
-    if not possible_units:
+    if not plausible_factors:
         return ""
-    likely_unit = min(possible_units, key=lambda u: abs(np.log(sigma0 / possible_units[u])))
+    likely_unit = min(plausible_factors, key=lambda u: abs(np.log(sigma0 / plausible_factors[u])))
     return (
         f"σ0 is {sigma0:.3g}: the a priori σ of the image coordinates, {sigma:.4g} {unit}, looks "
         f"like one in {likely_unit}; it is expected in {unit}: "
-        f"{sigma * possible_units[likely_unit]:.3g} (times "
-        f"{possible_units[likely_unit]:.4g})"
+        f"{sigma * plausible_factors[likely_unit]:.3g} (times {plausible_factors[likely_unit]:.4g})"
     )
 
 
@@ -206,31 +204,31 @@ def name_pixels(network: Network) -> str:
     cause: without pixel size it cannot be distinguished from a telescope."""
     of_camera = network.images.camera[network.observations.image]
     rows = (network.observations.xy[of_camera == c] for c in range(len(network.cameras)))
-    first_message, *other_messages = [
+    first_message, *further_messages = [
         line
         for camera, xy in zip(network.cameras, rows, strict=True)
         if len(xy) and (line := _in_pixels(camera, xy))
     ] or [""]
     return first_message + (
-        f"; so with {count(len(other_messages), 'other camera')}" if other_messages else ""
+        f"; so with {count(len(further_messages), 'other camera')}" if further_messages else ""
     )
 
 
 def _in_pixels(camera: Camera, xy: Float[np.ndarray, "rays 2"]) -> str:
     model = get_model(camera.model)
     name, c = model.principal_distance[0], float(camera.parameters[model.principal_distance[0]])
-    spread_of_points = float(np.median(np.hypot(*(xy - np.median(xy, axis=0)).T)))
+    median_radius = float(np.median(np.hypot(*(xy - np.median(xy, axis=0)).T)))
     if (
         model.unit != "mm"
         or c < LIMITS.min_pixels
-        or not 0 < spread_of_points < LIMITS.narrow_field * c
+        or not 0 < median_radius < LIMITS.narrow_field * c
     ):
         return ""
     expected = "multiplied by the size of a pixel"
     pixels = None
     if camera.pixel_size is not None:
         pixels, expected = (
-            spread_of_points / max(camera.pixel_size),
+            median_radius / max(camera.pixel_size),
             f"{c * max(camera.pixel_size):.4g}",
         )
     elif camera.image_size is not None:
@@ -239,13 +237,13 @@ def _in_pixels(camera: Camera, xy: Float[np.ndarray, "rays 2"]) -> str:
         return ""
     return (
         f"camera {camera.id!r}: {name} is {c:g} mm and half of its image points lie within "
-        f"{spread_of_points:.3g} mm of their centre, "
-        f"{np.degrees(np.arctan(spread_of_points / c)):.2g}° for such a "
+        f"{median_radius:.3g} mm of their centre, "
+        f"{np.degrees(np.arctan(median_radius / c)):.2g}° for such a "
         f"lens: is {name} in pixels? It is expected in mm ({expected})"
     )
 
 
-def _remedy(camera: Camera, unit: str, name: str, c: float, usual: float) -> str:
+def _remedy(camera: Camera, unit: str, name: str, c: float, median_radius: float) -> str:
     if unit != "mm":
         return f"Is {name} in mm? It is expected in {unit}: divided by the size of a pixel"
     causes = []
@@ -254,7 +252,7 @@ def _remedy(camera: Camera, unit: str, name: str, c: float, usual: float) -> str
             f"Is pixel_size {max(camera.pixel_size):g} in µm? It is expected in mm "
             f"({max(camera.pixel_size) / 1000:g})"
         )
-    if LIMITS.fields[0] < usual / (1000 * c) < LIMITS.fields[1]:
+    if LIMITS.fields[0] < median_radius / (1000 * c) < LIMITS.fields[1]:
         causes.append(f"Is {name} in metres? It is expected in mm ({1000 * c:g})")
     causes.append(
         'Are the image coordinates pixels? Set image_unit = "px" and give the camera its '
@@ -272,7 +270,7 @@ def _control_against_ties(network: Network) -> str:
     if min(control.sum(), tie.sum()) < 3:
         return ""
     extents = [float(np.ptp(points.position[rows], axis=0).max()) for rows in (control, tie)]
-    if not _thousand(*extents):
+    if not _is_thousandfold(*extents):
         return ""
     return (
         f"the control points extend over {extents[0]:.4g} and the start values of the tie points "
@@ -289,20 +287,21 @@ def _distances_against_control(network: Network) -> str:
         return ""
     a, b = points.position[distances.points].transpose(1, 0, 2)
     length = np.linalg.norm(a - b, axis=1)
-    contradictions = [
+    suspicious_pairs = [
         f"{points.id[i]} to {points.id[j]}"
         for row, (i, j) in enumerate(distances.points)
-        if is_known[i] and is_known[j] and _thousand(distances.value[row], length[row])
+        if is_known[i] and is_known[j] and _is_thousandfold(distances.value[row], length[row])
     ]
-    if not contradictions:
+    if not suspicious_pairs:
         return ""
     return (
         f"distances a thousand times those of the control points, or a thousandth: "
-        f"{list_some(contradictions)}; are they in {network.object_unit}, like the control points?"
+        f"{list_some(suspicious_pairs)}; are they in {network.object_unit}, like the control "
+        "points?"
     )
 
 
-def _thousand(a: float, b: float) -> bool:
+def _is_thousandfold(a: float, b: float) -> bool:
     if not min(a, b) > 0:
         return False
     return LIMITS.thousand[0] < max(a / b, b / a) < LIMITS.thousand[1]

@@ -117,20 +117,24 @@ def _convert(
     camera: Int[np.ndarray, " n"],
     xy: Float[np.ndarray, "n 2"],
     sigma: Float[np.ndarray, "n 2"],
-    from_units: Sequence[str],
-    to_units: Sequence[str],
+    source_units: Sequence[str],
+    target_units: Sequence[str],
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Per camera: nothing, pixels to mm, or mm to pixels."""
-    if list(from_units) == list(to_units):
+    if list(source_units) == list(target_units):
         return xy, sigma
     # Only cameras whose unit differs need sizes: the others must not be refused for lacking them.
     centre, pitch = np.zeros((len(cameras), 2)), np.ones((len(cameras), 2))
     for c in np.unique(camera):
-        if from_units[c] != to_units[c]:
+        if source_units[c] != target_units[c]:
             centre[c], pitch[c] = _pixel_grid(cameras[c])
     centre, pitch = centre[camera], pitch[camera]
-    to_mm = np.array([(h, w) == ("px", "mm") for h, w in zip(from_units, to_units)])[camera, None]
-    to_px = np.array([(h, w) == ("mm", "px") for h, w in zip(from_units, to_units)])[camera, None]
+    to_mm = np.array([(h, w) == ("px", "mm") for h, w in zip(source_units, target_units)])[
+        camera, None
+    ]
+    to_px = np.array([(h, w) == ("mm", "px") for h, w in zip(source_units, target_units)])[
+        camera, None
+    ]
     converted = np.where(to_px, _to_px(xy, centre, pitch), xy)
     xy = np.where(to_mm, _to_mm(xy, centre, pitch), converted)
     size = np.abs(pitch)

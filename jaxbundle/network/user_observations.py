@@ -21,16 +21,16 @@ OWN = ("image", "camera", "point")
 
 @dataclasses.dataclass(frozen=True)
 class InObjectSpace:
-    """A residual whose blocks of points and poses (`of`) are moved from the network's origin to
-    object coordinates."""
+    """A residual whose blocks of points and poses are moved from the network's origin to
+    object coordinates; `tables`: those of its blocks."""
 
     residual: Callable
-    of: tuple[str, ...]
+    tables: tuple[str, ...]
     origin: tuple[float, float, float]
 
     def __call__(self, *blocks_and_measured: Any) -> Any:
         *blocks, measured = blocks_and_measured
-        return self.residual(*map(self._place, self.of, blocks), measured)
+        return self.residual(*map(self._place, self.tables, blocks), measured)
 
     def _place(self, table: str, block: Any) -> Block:
         # Blocks of the network are relative to its origin; residuals of users are written for
@@ -51,13 +51,13 @@ def split_by_type(
     """The tables and the observations of them.
 
     **Raises:** `InputError` for anything else, and for the name of a table of the network."""
-    tables = [item for item in also if isinstance(item, Table)]
-    observations = [item for item in also if isinstance(item, ObservationSet)]
-    for item in also:
-        if not isinstance(item, Table | ObservationSet):
+    tables = [declaration for declaration in also if isinstance(declaration, Table)]
+    observations = [declaration for declaration in also if isinstance(declaration, ObservationSet)]
+    for declaration in also:
+        if not isinstance(declaration, Table | ObservationSet):
             raise InputError(
                 "also: expected tables (leastsquares.Table) and observations (a Kind, called), "
-                f"got {show(item)}"
+                f"got {show(declaration)}"
             )
     for table in tables:
         if table.name.split(",")[0] in OWN:
@@ -65,10 +65,12 @@ def split_by_type(
     return tables, observations
 
 
-def place(observation_set: ObservationSet, origin: Float[np.ndarray, "3"]) -> ObservationSet:
-    """The observations in the coordinates of the arrays."""
-    kind, (X, Y, Z) = observation_set.kind, (float(x) for x in origin)
+def place_in_object_space(
+    observations: ObservationSet, origin: Float[np.ndarray, "3"]
+) -> ObservationSet:
+    """The observations, with a residual of object coordinates (`InObjectSpace`)."""
+    kind, (X, Y, Z) = observations.kind, (float(x) for x in origin)
     if not {"image", "point"} & set(kind.of):
-        return observation_set
+        return observations
     residual = InObjectSpace(kind.residual, kind.of, (X, Y, Z))
-    return dataclasses.replace(observation_set, kind=dataclasses.replace(kind, residual=residual))
+    return dataclasses.replace(observations, kind=dataclasses.replace(kind, residual=residual))

@@ -49,19 +49,21 @@ def _by_rays(network: Network, sights: Sights, model: Model) -> Similarity | Non
         return None
     image, point = sights.image[rows], sights.point[rows]
     rays = np.einsum("nij,ni->nj", model.M[image], sights.ray[rows])
-    is_seen = model.known[sights.point] & model.placed[sights.image]
-    sight = model.X[sights.point[is_seen]] - model.X0[sights.image[is_seen]]
-    usual_distance = np.median(np.linalg.norm(sight, axis=1))
-    point_on_ray = np.where(
+    usable = model.known[sights.point] & model.placed[sights.image]
+    to_points = model.X[sights.point[usable]] - model.X0[sights.image[usable]]
+    usual_distance = np.median(np.linalg.norm(to_points, axis=1))
+    approximate_X = np.where(
         model.known[point, None], model.X[point], model.X0[image] + usual_distance * rays
     )
-    start = similarity(points.position[point], point_on_ray)
+    start = similarity(points.position[point], approximate_X)
     if start is None:
         return None
     # From the control points to the model, not back: the misclosures are then angles at the
     # projection centres of the model, and the inverse is exact.
-    A, t, sight = batched.similarity_by_rays(points.position[point], model.X0[image], rays, *start)
-    if not np.median(sight) < np.median(sights.tolerance[image]):
+    A, t, misclosures = batched.similarity_by_rays(
+        points.position[point], model.X0[image], rays, *start
+    )
+    if not np.median(misclosures) < np.median(sights.tolerance[image]):
         return None
     inverse = np.linalg.inv(A)
     return inverse, -inverse @ t
@@ -85,11 +87,11 @@ def scale_of_lengths(network: Network, model: Model) -> float | None:
 def scale_of_distances(network: Network, model: Model) -> float | None:
     """The median of measured distances by those in the model."""
     distances = network.distances
-    has_both = model.known[distances.points].all(1) if len(distances) else np.zeros(0, bool)
-    if not has_both.any():
+    is_known = model.known[distances.points].all(1) if len(distances) else np.zeros(0, bool)
+    if not is_known.any():
         return None
-    a, b = model.X[distances.points[has_both]].transpose(1, 0, 2)
-    return float(np.median(distances.value[has_both] / np.linalg.norm(a - b, axis=1)))
+    a, b = model.X[distances.points[is_known]].transpose(1, 0, 2)
+    return float(np.median(distances.value[is_known] / np.linalg.norm(a - b, axis=1)))
 
 
 def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
@@ -103,7 +105,7 @@ def _scale_of_other_lengths(network: Network, model: Model) -> float | None:
         images, position=model.X0[placed], angles=batched.angles(model.M[placed])
     )
     part = network.replace(images=oriented)
-    ratios = [ratio for kind in network.further for ratio in kind.among(part).scales(part)]
+    ratios = [ratio for table in network.further for ratio in table.restrict_to(part).scales(part)]
     return float(np.median(ratios)) if ratios else None
 
 
@@ -112,28 +114,30 @@ def join(network: Network, sights: Sights, model: Model, part: Model) -> Model |
 
     The similarity is found from common points, or from the pose of a common image and the distances
     to common points, without these from known lengths in either."""
-    in_both = model.known & part.known
-    shared = np.flatnonzero(model.placed & part.placed)
-    if not in_both.any():
+    common_points = model.known & part.known
+    common_images = np.flatnonzero(model.placed & part.placed)
+    if not common_points.any():
         # Two pairs of a chain have an image in common and no point: the ratio of their bases is in
         # no image point, only in known lengths of both.
-        own_scale, other_scale = scale_of_lengths(network, model), scale_of_lengths(network, part)
-        if not len(shared) or own_scale is None or other_scale is None:
+        model_scale, part_scale = scale_of_lengths(network, model), scale_of_lengths(network, part)
+        if not len(common_images) or model_scale is None or part_scale is None:
             return None
-        transformation = _by_an_image(model, part, shared[0], other_scale / own_scale)
-    elif len(shared):
+        transformation = _by_an_image(model, part, common_images[0], part_scale / model_scale)
+    elif len(common_images):
         # The common image gives all but the scale. A similarity by the points would also take
         # rotation and shift from them, and of two bundles points are known worst in depth.
-        common_by_image = np.bincount(sights.image, in_both[sights.point], minlength=sights.images)
-        image = shared[common_by_image[shared].argmax()]
-        distance_in_model, distance_in_part = (
-            np.linalg.norm(m.X[in_both] - m.X0[image], axis=1) for m in (model, part)
+        common_point_counts = np.bincount(
+            sights.image, common_points[sights.point], minlength=sights.images
+        )
+        image = common_images[common_point_counts[common_images].argmax()]
+        model_distances, part_distances = (
+            np.linalg.norm(m.X[common_points] - m.X0[image], axis=1) for m in (model, part)
         )
         transformation = _by_an_image(
-            model, part, image, np.median(distance_in_model / distance_in_part)
+            model, part, image, np.median(model_distances / part_distances)
         )
     else:
-        transformation = similarity(part.X[in_both], model.X[in_both])
+        transformation = similarity(part.X[common_points], model.X[common_points])
     if transformation is None:
         return None
     part = part.transform(*transformation)
@@ -203,10 +207,10 @@ def similarity(
         if transformation is None or len(source) < 6:
             return transformation
         A, t = transformation
-        distance = np.linalg.norm(source @ A.T + t - target, axis=1)
+        distances = np.linalg.norm(source @ A.T + t - target, axis=1)
         # The median of a distance in space is 1.54 σ of a coordinate: beyond three medians is one
         # good point in ten thousand. The 1e-9 is rounding: of exact points the median is zero.
-        good = distance <= 3 * np.median(distance) + 1e-9 * np.ptp(target, axis=0).max()
+        good = distances <= 3 * np.median(distances) + 1e-9 * np.ptp(target, axis=0).max()
     return transformation
 
 
@@ -225,20 +229,20 @@ def similarity_of_most(
     triples = list(itertools.islice(itertools.combinations(range(n), 3), number + 1))
     if len(triples) > number:
         triples = [rng.choice(n, 3, replace=False) for _ in range(number)]
-    best, least_median = None, np.inf
+    best, least_quantile = None, np.inf
     for triple in triples:
         transformation = batched.similarity(
             source, target, np.isin(np.arange(n), triple).astype(float)
         )
         if transformation is not None:
-            distance = np.linalg.norm(
+            distances = np.linalg.norm(
                 source @ transformation[0].T + transformation[1] - target, axis=1
             )
             # Not the median: the three points of the triple fit nearly exactly, and would make half
             # of few points.
-            if (middle := np.sort(distance)[min(n, n // 2 + 2) - 1]) < least_median:
-                best, least_median = distance, middle
+            if (quantile := np.sort(distances)[min(n, n // 2 + 2) - 1]) < least_quantile:
+                best, least_quantile = distances, quantile
     if best is None:
         return None
-    limit = max(OUTLIER_LIMIT * NORMAL_SIGMA_BY_MAD * least_median, np.sort(best)[2])
+    limit = max(OUTLIER_LIMIT * NORMAL_SIGMA_BY_MAD * least_quantile, np.sort(best)[2])
     return batched.similarity(source, target, (best <= limit).astype(float))

@@ -59,7 +59,7 @@ def resect(
 ]:
     """X0, M of images, and the share of their points that agree within `tolerance` (c = 1); 0: no
     pose."""
-    rows = [spread(len(a)) for a in xy]
+    rows = [evenly_spaced(len(a)) for a in xy]
     X0, M, share = run_in_lanes(
         _resect,
         LANES,
@@ -78,7 +78,7 @@ def refine(
     weights: Weights,
 ) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"]]:
     """X0, M of images improved from start values by points of weight > 0."""
-    rows = [spread(len(a)) for a in xy]
+    rows = [evenly_spaced(len(a)) for a in xy]
     X0, M = run_in_lanes(
         _refine,
         LANES,
@@ -100,7 +100,7 @@ def orient_pairs(
 ]:
     """M, b of pairs of images, the share of the points that agree within `tolerance`, and the
     median angle of intersection (radians)."""
-    rows = [spread(len(a)) for a in xy1]
+    rows = [evenly_spaced(len(a)) for a in xy1]
     M, b, share, angle = run_in_lanes(
         _orient_pair,
         LANES,
@@ -121,7 +121,7 @@ def orient_planes(
     Bool[np.ndarray, "pairs 2"],
 ]:
     """Both M, b and normals of pairs of images of planes, and whether each is possible."""
-    rows = [spread(len(a)) for a in xy1]
+    rows = [evenly_spaced(len(a)) for a in xy1]
     M, b, normal, possible = run_in_lanes(
         _orient_plane, LANES, _gather_slots(xy1, rows), _gather_slots(xy2, rows), _weights(rows)
     )
@@ -144,7 +144,7 @@ def similarity(
     weights: Float[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
     """A = exp(s)·R and t of X' = A·X + t between two lists of points; None of points on a line."""
-    rows = [spread(len(source))]
+    rows = [evenly_spaced(len(source))]
     A, t, status = run_in_lanes(
         _similarity,
         1,
@@ -164,11 +164,11 @@ def similarity_by_rays(
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], Float[np.ndarray, " slots"]]:
     """A and t of X' = A·X + t by which points X come to lie on rays, from start values; and the
     misclosure of every ray, the tangent of its angle."""
-    rows = [spread(len(X))]
+    rows = [evenly_spaced(len(X))]
     filled = (_gather_slots([a], rows) for a in (X, X0, rays))
     weights = _weights(rows)
-    A, t, distances = run_in_lanes(_similarity_by_rays, 1, *filled, weights, A[None], t[None])
-    return A[0], t[0], distances[0][: len(rows[0])]
+    A, t, misclosures = run_in_lanes(_similarity_by_rays, 1, *filled, weights, A[None], t[None])
+    return A[0], t[0], misclosures[0][: len(rows[0])]
 
 
 def matrices(angles: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
@@ -200,11 +200,11 @@ def prepare() -> None:
     intersect(rng.normal(size=(1, RAYS, 3)), rng.normal(size=(1, RAYS, 3)), np.ones((1, RAYS)))
 
 
-def evenly_spaced(number: int, most: int = SLOTS) -> Int[np.ndarray, " rows"]:
-    """Up to `most` of a number of rows, evenly."""
-    if number <= most:
+def evenly_spaced(number: int, max_rows: int = SLOTS) -> Int[np.ndarray, " rows"]:
+    """Up to `max_rows` of a number of rows, evenly."""
+    if number <= max_rows:
         return np.arange(number)
-    return np.linspace(0, number - 1, most).astype(int)
+    return np.linspace(0, number - 1, max_rows).astype(int)
 
 
 @quick_jit
@@ -217,10 +217,10 @@ def _resect(
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
     # One key for all: equal data give equal start values, whatever else is in the network.
     key = jax.random.key(0)
-    resected, good = robust_resection(key, xy, X, weights, threshold=tolerance)
-    is_sound = (resected.status == int(Status.SOUND)) & jnp.all(jnp.isfinite(resected.pose.X0))
+    solution, good = robust_resection(key, xy, X, weights, threshold=tolerance)
+    sound = (solution.status == int(Status.SOUND)) & jnp.all(jnp.isfinite(solution.pose.X0))
     share = jnp.sum(good) / jnp.sum(weights > 0)
-    return resected.pose.X0, resected.pose.M, jnp.where(is_sound, share, 0.0)
+    return solution.pose.X0, solution.pose.M, jnp.where(sound, share, 0.0)
 
 
 @quick_jit
@@ -232,9 +232,9 @@ def _refine(
     X: Float[Array, "slots 3"],
     weights: Float[Array, " slots"],
 ) -> tuple[Array, Array]:
-    refined = refine_resection(CameraPose(X0, M), xy, X, weights).pose
-    good = jnp.all(jnp.isfinite(refined.X0)) & jnp.all(jnp.isfinite(refined.M))
-    return jnp.where(good, refined.X0, X0), jnp.where(good, refined.M, M)
+    pose = refine_resection(CameraPose(X0, M), xy, X, weights).pose
+    good = jnp.all(jnp.isfinite(pose.X0)) & jnp.all(jnp.isfinite(pose.M))
+    return jnp.where(good, pose.X0, X0), jnp.where(good, pose.M, M)
 
 
 @quick_jit
@@ -246,16 +246,14 @@ def _orient_pair(
     tolerance: Float[Array, ""],
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     key = jax.random.key(0)
-    oriented, good = robust_relative_orientation(key, xy1, xy2, weights, threshold=tolerance)
+    solution, good = robust_relative_orientation(key, xy1, xy2, weights, threshold=tolerance)
     ray = lambda xy: jnp.append(xy, -1.0) / jnp.sqrt(1 + xy @ xy)
-    rays_1, rays_2 = jax.vmap(ray)(xy1), jax.vmap(ray)(xy2) @ oriented.M
-    angle = jnp.arctan2(
-        jnp.linalg.norm(jnp.cross(rays_1, rays_2), axis=1), jnp.sum(rays_1 * rays_2, 1)
-    )
+    rays1, rays2 = jax.vmap(ray)(xy1), jax.vmap(ray)(xy2) @ solution.M
+    angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(rays1, rays2), axis=1), jnp.sum(rays1 * rays2, 1))
     number = jnp.sum(good)
     ordered = jnp.sort(jnp.where(good, angle, jnp.inf))
-    share = jnp.where(oriented.status == int(Status.SOUND), number / jnp.sum(weights > 0), 0.0)
-    return oriented.M, oriented.b, share, jnp.where(number > 0, ordered[number // 2], 0.0)
+    share = jnp.where(solution.status == int(Status.SOUND), number / jnp.sum(weights > 0), 0.0)
+    return solution.M, solution.b, share, jnp.where(number > 0, ordered[number // 2], 0.0)
 
 
 @partial(compile_once, static=())
@@ -263,8 +261,8 @@ def _orient_pair(
 def _intersect(
     X0: Float[Array, "rays 3"], rays: Float[Array, "rays 3"], weights: Float[Array, " rays"]
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
-    intersected = intersection(X0, rays, weights)
-    return intersected.X, intersected.angle, intersected.status
+    solution = intersection(X0, rays, weights)
+    return solution.X, solution.angle, solution.status
 
 
 @quick_jit
@@ -274,8 +272,8 @@ def _similarity(
     target: Float[Array, "slots 3"],
     weights: Float[Array, " slots"],
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
-    absolute = absolute_orientation(source, target, weights)
-    return (*_as_matrix(absolute.tau), absolute.status)
+    solution = absolute_orientation(source, target, weights)
+    return (*_as_matrix(solution.tau), solution.status)
 
 
 @quick_jit
@@ -301,8 +299,8 @@ def _similarity_by_rays(
     # Weights are 0 or 1, their own roots. The start guesses a depth for points seen once, so that
     # more steps are allowed than the 30 of a closed form.
     tau, _ = minimise(misclosures, jnp.add, start, (X, X0, rays, weights), 7, 40)
-    differences = misclosures(tau, X, X0, rays, weights).reshape(-1, 2)
-    return (*_as_matrix(tau), jnp.linalg.norm(differences, axis=1))
+    ray_misclosures = misclosures(tau, X, X0, rays, weights).reshape(-1, 2)
+    return (*_as_matrix(tau), jnp.linalg.norm(ray_misclosures, axis=1))
 
 
 def _as_matrix(tau: Float[AnyArray, "7"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
@@ -340,12 +338,12 @@ def _angles(M: Float[Array, "3 3"]) -> tuple[Float[Array, "3"]]:
 def _orient_plane(
     xy1: Float[Array, "slots 2"], xy2: Float[Array, "slots 2"], weights: Float[Array, " slots"]
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    orientations = planar_orientations(xy1, xy2, weights)
+    solution = planar_orientations(xy1, xy2, weights)
     return (
-        orientations.M,
-        orientations.b,
-        orientations.normal,
-        orientations.possible & (orientations.status == int(Status.SOUND)),
+        solution.M,
+        solution.b,
+        solution.normal,
+        solution.possible & (solution.status == int(Status.SOUND)),
     )
 
 
@@ -370,6 +368,6 @@ def run_in_lanes(
     number = len(arrays[0])
     parts = []
     for begin in range(0, number, lanes):
-        items = np.minimum(np.arange(begin, begin + lanes), number - 1)
-        parts.append(jax.device_get(program(*(np.asarray(a)[items] for a in arrays))))
+        lane_items = np.minimum(np.arange(begin, begin + lanes), number - 1)
+        parts.append(jax.device_get(program(*(np.asarray(a)[lane_items] for a in arrays))))
     return tuple(np.concatenate(column)[:number] for column in zip(*parts))

@@ -31,7 +31,7 @@ from jaxbundle.orientation.rays import Sights
 
 
 def rays_coincide(
-    sighted: Sights,
+    sights: Sights,
     model: Model,
     points: Bool[np.ndarray, " points"],
     factor: float = 1.0,
@@ -42,75 +42,75 @@ def rays_coincide(
 
     **Arguments:** `factor`: of the a priori σ of the rays, such as σ0; `significance`: probability
     that parallel rays are taken for converging ones, that of the tests of single observations."""
-    no_points = np.zeros(sighted.points, bool)
-    rows = np.flatnonzero(model.placed[sighted.image] & points[sighted.point] & (sighted.sigma > 0))
-    image, point = sighted.image[rows], sighted.point[rows]
-    number = np.bincount(point, minlength=sighted.points)
+    no_points = np.zeros(sights.points, bool)
+    rows = np.flatnonzero(model.placed[sights.image] & points[sights.point] & (sights.sigma > 0))
+    image, point = sights.image[rows], sights.point[rows]
+    number = np.bincount(point, minlength=sights.points)
     if not (number > 1).any() or not factor > 0:
         return no_points, no_points
     total = lambda values: np.stack(
-        [np.bincount(point, v, sighted.points) for v in values.reshape(len(rows), -1).T], 1
+        [np.bincount(point, v, sights.points) for v in values.reshape(len(rows), -1).T], 1
     )
-    d = np.einsum("nij,ni->nj", model.M[image], sighted.ray[rows])
-    measured = np.bincount(sighted.image[sighted.sigma > 0], minlength=sighted.images)[image]
-    p = 1 / ((factor * sighted.sigma[rows]) ** 2 * (1 + 3 / measured))
+    d = np.einsum("nij,ni->nj", model.M[image], sights.ray[rows])
+    measured = np.bincount(sights.image[sights.sigma > 0], minlength=sights.images)[image]
+    p = 1 / ((factor * sights.sigma[rows]) ** 2 * (1 + 3 / measured))
     S = total(p[:, None, None] * d[:, :, None] * d[:, None, :]).reshape(-1, 3, 3)
     u = np.linalg.eigh(S)[1][:, :, 2]
-    sum_of_p = np.maximum(np.bincount(point, p, sighted.points), 1e-300)[:, None]
-    from_mean_station = model.X0[image] - (total(p[:, None] * model.X0[image]) / sum_of_p)[point]
+    sum_of_p = np.maximum(np.bincount(point, p, sights.points), 1e-300)[:, None]
+    centred_X0 = model.X0[image] - (total(p[:, None] * model.X0[image]) / sum_of_p)[point]
     u = u[point]
-    across_line = lambda v: v - (v * u).sum(1, keepdims=True) * u
-    r, direction_across = (
-        across_line(from_mean_station),
-        across_line(d) * np.sign((d * u).sum(1, keepdims=True)),
+    perpendicular = lambda v: v - (v * u).sum(1, keepdims=True) * u
+    r, d_perpendicular = (
+        perpendicular(centred_X0),
+        perpendicular(d) * np.sign((d * u).sum(1, keepdims=True)),
     )
-    usual = usual_distances(sighted, model)[image, None]
-    misses = lambda v: np.bincount(point, p * np.square(v).sum(1), sighted.points)
+    usual_distance = usual_distances(sights, model)[image, None]
+    weighted_squares = lambda v: np.bincount(point, p * np.square(v).sum(1), sights.points)
     limit = _quantiles(2 * number - 2, significance)
     one_line = number > 1
     # One value of s is not enough: rays that converge at the usual distance by chance, or because
     # the point is there, pass its test too.
-    for distance in (0.5 * usual, usual, 2 * usual):
-        one_line &= misses(r / distance + direction_across) < limit
-    return one_line, one_line & (misses(from_mean_station / usual) < limit)
+    for distance in (0.5 * usual_distance, usual_distance, 2 * usual_distance):
+        one_line &= weighted_squares(r / distance + d_perpendicular) < limit
+    return one_line, one_line & (weighted_squares(centred_X0 / usual_distance) < limit)
 
 
 def see_collinear_points(
-    sighted: Sights, model: Model, factor: float = 1.0, significance: float = 0.001
+    sights: Sights, model: Model, factor: float = 1.0, significance: float = 0.001
 ) -> Bool[np.ndarray, " images"]:
     """Which images see known points on a line only, or fewer than three. Images that are not placed
     count as at the usual distance.
 
     **Arguments:** as of `rays_coincide`."""
-    rows = np.flatnonzero(model.known[sighted.point] & (sighted.sigma > 0))
-    image = sighted.image[rows]
-    number = np.bincount(image, minlength=sighted.images)
-    X, placed = model.X[sighted.point[rows]], model.placed[image]
+    rows = np.flatnonzero(model.known[sights.point] & (sights.sigma > 0))
+    image = sights.image[rows]
+    number = np.bincount(image, minlength=sights.images)
+    X, placed = model.X[sights.point[rows]], model.placed[image]
     distance = np.linalg.norm(X - model.X0[image], axis=1)
-    distance = np.where(placed, distance, usual_distances(sighted, model)[image])
+    distance = np.where(placed, distance, usual_distances(sights, model)[image])
     # Distances of the points from the image weigh their offsets; the line is that of least squares.
-    sqrt_p = 1 / (factor * sighted.sigma[rows] * distance)
+    sqrt_p = 1 / (factor * sights.sigma[rows] * distance)
     total = lambda values: np.stack(
-        [np.bincount(image, v, sighted.images) for v in values.reshape(len(rows), -1).T], 1
+        [np.bincount(image, v, sights.images) for v in values.reshape(len(rows), -1).T], 1
     )
-    sum_of_p = np.maximum(np.bincount(image, sqrt_p**2, sighted.images), 1e-300)[:, None]
-    distance = X - (total(sqrt_p[:, None] ** 2 * X) / sum_of_p)[image]
-    scaled = sqrt_p[:, None] * distance
+    sum_of_p = np.maximum(np.bincount(image, sqrt_p**2, sights.images), 1e-300)[:, None]
+    centred_X = X - (total(sqrt_p[:, None] ** 2 * X) / sum_of_p)[image]
+    scaled = sqrt_p[:, None] * centred_X
     C = total(scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 3, 3)
-    across_line = np.linalg.eigvalsh(C)[:, :2].sum(1)
-    return (number > 0) & (across_line < _quantiles(2 * number - 4, significance))
+    squared_offsets = np.linalg.eigvalsh(C)[:, :2].sum(1)
+    return (number > 0) & (squared_offsets < _quantiles(2 * number - 4, significance))
 
 
-def usual_distances(sighted: Sights, model: Model) -> Float[np.ndarray, " images"]:
+def usual_distances(sights: Sights, model: Model) -> Float[np.ndarray, " images"]:
     """The median distance from every image to its known points; where it has none, that of all."""
-    rows = np.flatnonzero(model.placed[sighted.image] & model.known[sighted.point])
-    image = sighted.image[rows]
-    s = np.linalg.norm(model.X[sighted.point[rows]] - model.X0[image], axis=1)
-    usual = np.full(sighted.images, np.median(s) if len(s) else np.inf)
+    rows = np.flatnonzero(model.placed[sights.image] & model.known[sights.point])
+    image = sights.image[rows]
+    s = np.linalg.norm(model.X[sights.point[rows]] - model.X0[image], axis=1)
+    median_distance = np.full(sights.images, np.median(s) if len(s) else np.inf)
     order = np.lexsort((s, image))
     begin, number = np.unique(image[order], return_index=True, return_counts=True)[1:]
-    usual[image[order][begin]] = s[order][begin + number // 2]
-    return usual
+    median_distance[image[order][begin]] = s[order][begin + number // 2]
+    return median_distance
 
 
 def _quantiles(degrees: Int[np.ndarray, " n"], significance: float) -> Float[np.ndarray, " n"]:

@@ -48,12 +48,12 @@ class Discrepancies:
 
     **Fields:** `difference` [n, 3]; `covariance` [n, 3, n, 3] of it, without that of
     control; `sigma` [n, 3] of control: NaN where it is to be estimated, infinite on axes that are
-    not controlled; `open` [n, 3, k], what the block leaves open."""
+    not controlled; `open_motions` [n, 3, k] of the points, which the block leaves open."""
 
     difference: Float[np.ndarray, "n 3"]
     covariance: Float[np.ndarray, "n 3 n 3"]
     sigma: Float[np.ndarray, "n 3"]
-    open: Float[np.ndarray, "n 3 k"]
+    open_motions: Float[np.ndarray, "n 3 k"]
 
     def __len__(self) -> int:
         return len(self.difference)
@@ -91,9 +91,15 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
     `significance`: probability of suspecting any point of control without contradictions.
     """
     if not len(discrepancies):
-        nothing, lacking = np.zeros((0, 3)), (True, True)
+        no_values, both_assumed = np.zeros((0, 3)), (True, True)
         return Assessment(
-            np.zeros(0, bool), nothing, (0.0, 0.0), nothing, nothing, np.zeros(0), lacking
+            np.zeros(0, bool),
+            no_values,
+            (0.0, 0.0),
+            no_values,
+            no_values,
+            np.zeros(0),
+            both_assumed,
         )
     is_used = _search(discrepancies, assumed, significance)
     factor = 1.0
@@ -101,7 +107,7 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
         everything = np.ones(len(discrepancies), bool)
         sigma, *_ = _resolve(discrepancies, everything, assumed)
         W, d, rows = _weight_matrix(discrepancies, sigma, everything)
-        redundancy = len(rows) - discrepancies.open.shape[2]
+        redundancy = len(rows) - discrepancies.open_motions.shape[2]
         factor = float(np.sqrt(max(d @ W @ d / max(redundancy, 1), 1.0)))
         scaled = np.where(
             np.isfinite(discrepancies.sigma), discrepancies.sigma * factor, discrepancies.sigma
@@ -109,7 +115,7 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
         discrepancies = dataclasses.replace(discrepancies, sigma=scaled)
         is_used = _search(discrepancies, assumed, significance)
     sigma, redundancy, guessed = _resolve(discrepancies, is_used, assumed)
-    error, sigma_of_error = np.full((2, len(discrepancies), 3), np.nan)
+    error, error_sigma = np.full((2, len(discrepancies), 3), np.nan)
     probability = np.full(len(discrepancies), np.nan)
     common = (
         _linearise(discrepancies, is_used, is_used, assumed)
@@ -119,10 +125,8 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
     for i in range(len(discrepancies)):
         test = _predict(discrepancies, is_used, [i], assumed, common if is_used[i] else None)
         if test is not None:
-            error[i], sigma_of_error[i], probability[i] = test
-    return Assessment(
-        is_used, sigma, redundancy, error, sigma_of_error, probability, guessed, factor
-    )
+            error[i], error_sigma[i], probability[i] = test
+    return Assessment(is_used, sigma, redundancy, error, error_sigma, probability, guessed, factor)
 
 
 def _search(
@@ -154,10 +158,13 @@ def _most_improbable(
     """The point, or else the two points, of at most this number, that are most improbable; none if
     chance explains all."""
     rows = np.flatnonzero(is_used).tolist()
-    is_few = len(rows) <= MAX_POINTS_FOR_PAIRS
+    tests_pairs = len(rows) <= MAX_POINTS_FOR_PAIRS
     # Of many points one changes the estimated σ by too little to matter.
-    common = None if is_few else _linearise(discrepancies, is_used, is_used, assumed)
-    for tests in ([[i] for i in rows], [list(p) for p in itertools.combinations(rows, 2)] * is_few):
+    common = None if tests_pairs else _linearise(discrepancies, is_used, is_used, assumed)
+    for tests in (
+        [[i] for i in rows],
+        [list(p) for p in itertools.combinations(rows, 2)] * tests_pairs,
+    ):
         if tests and len(tests[0]) <= max_points:
             p = [_probability(discrepancies, is_used, test, assumed, common) for test in tests]
             if min(p) < level_of_one(significance, len(tests)):
@@ -190,12 +197,12 @@ class _WeightedDiscrepancies(NamedTuple):
 
 def _linearise(
     discrepancies: Discrepancies,
-    other_points: Bool[np.ndarray, " n"],
+    for_sigma: Bool[np.ndarray, " n"],
     points: Bool[np.ndarray, " n"],
     assumed: float,
 ) -> _WeightedDiscrepancies:
-    """W and W·d of `points`, with σ estimated from `other_points`."""
-    sigma, redundancy, _ = _resolve(discrepancies, other_points, assumed)
+    """W and W·d of `points`, with σ estimated from `for_sigma`."""
+    sigma, redundancy, _ = _resolve(discrepancies, for_sigma, assumed)
     W, d, rows = _weight_matrix(discrepancies, sigma, points)
     return _WeightedDiscrepancies(sigma, redundancy, W, W @ d, rows)
 
@@ -212,38 +219,38 @@ def _predict(
 
     **Arguments:** `model`: of all used points, instead of one with σ from the others."""
     if model is None:
-        other_points, points = is_used.copy(), is_used.copy()
-        other_points[list(tested)], points[list(tested)] = False, True
-        model = _linearise(discrepancies, other_points, points, assumed)
+        for_sigma, points = is_used.copy(), is_used.copy()
+        for_sigma[list(tested)], points[list(tested)] = False, True
+        model = _linearise(discrepancies, for_sigma, points, assumed)
     rows = model.rows
-    rows_tested = np.flatnonzero(np.isin(rows // 3, tested))
-    if not len(rows_tested):
+    tested_rows = np.flatnonzero(np.isin(rows // 3, tested))
+    if not len(tested_rows):
         return None
-    W_tested = model.W[np.ix_(rows_tested, rows_tested)]
+    W_tested = model.W[np.ix_(tested_rows, tested_rows)]
     # W_DD is singular where the others leave D open, by G: then it is zero but for rounding.
     scale = np.abs(np.diag(W_tested)).max(initial=0.0)
     if not scale or np.linalg.eigvalsh(W_tested)[0] < 1e-9 * scale:
         return None
     covariance = np.linalg.inv(W_tested)
-    e = covariance @ model.Wd[rows_tested]
-    unknown, p = np.isnan(discrepancies.sigma).ravel()[rows[rows_tested]], []
+    e = covariance @ model.Wd[tested_rows]
+    has_unknown_sigma, p = np.isnan(discrepancies.sigma).ravel()[rows[tested_rows]], []
     for height, freedom in enumerate(model.redundancy):
-        part = np.flatnonzero((rows[rows_tested] % 3 == 2) == height)
-        if not len(part) or (unknown[part].any() and freedom < MIN_REDUNDANCY):
+        part = np.flatnonzero((rows[tested_rows] % 3 == 2) == height)
+        if not len(part) or (has_unknown_sigma[part].any() and freedom < MIN_REDUNDANCY):
             continue  # an assumed σ tests nothing
         T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
         p.append(
             f_tail(T / len(part), len(part), freedom)
-            if unknown[part].any()
+            if has_unknown_sigma[part].any()
             else chi2_tail(T, len(part))
         )
     # Bonferroni: the smaller of two probabilities counts twice. Nothing tested: chance explains it.
     p = min(1.0, len(p) * min(p)) if p else 1.0
-    error, sigma_of_error = np.full(3, np.nan), np.full(3, np.nan)
-    is_first = rows[rows_tested] // 3 == tested[0]
-    axes = rows[rows_tested][is_first] % 3
-    error[axes], sigma_of_error[axes] = e[is_first], np.sqrt(np.diag(covariance))[is_first]
-    return error, sigma_of_error, p
+    error, error_sigma = np.full(3, np.nan), np.full(3, np.nan)
+    is_first = rows[tested_rows] // 3 == tested[0]
+    axes = rows[tested_rows][is_first] % 3
+    error[axes], error_sigma[axes] = e[is_first], np.sqrt(np.diag(covariance))[is_first]
+    return error, error_sigma, p
 
 
 def _weight_matrix(
@@ -256,7 +263,7 @@ def _weight_matrix(
         sigma.ravel()[rows] ** 2
     )
     W = np.linalg.inv(S)
-    G = discrepancies.open.reshape(n, -1)[rows]
+    G = discrepancies.open_motions.reshape(n, -1)[rows]
     if G.shape[1]:
         U = W @ G
         W = W - U @ np.linalg.pinv(G.T @ U, hermitian=True) @ U.T
@@ -268,15 +275,18 @@ def _resolve(
 ) -> tuple[Float[np.ndarray, "n 3"], tuple[float, float], tuple[bool, bool]]:
     """σ of control with the unknown ones estimated from the used points, their redundancy in the
     plane and in height, and whether they had to be assumed."""
-    unknown = np.isnan(discrepancies.sigma)
-    groups = [unknown & np.array([True, True, False]), unknown & np.array([False, False, True])]
-    sigma = np.where(unknown, assumed, discrepancies.sigma)
-    groups_used = [g for g in groups if (g & is_used[:, None]).any()]
+    is_unknown = np.isnan(discrepancies.sigma)
+    groups = [
+        is_unknown & np.array([True, True, False]),
+        is_unknown & np.array([False, False, True]),
+    ]
+    sigma = np.where(is_unknown, assumed, discrepancies.sigma)
+    estimated_groups = [g for g in groups if (g & is_used[:, None]).any()]
     redundancy = [0.0, 0.0]
-    if not groups_used:
+    if not estimated_groups:
         return sigma, (0.0, 0.0), (bool(groups[0].any()), bool(groups[1].any()))
     start = np.abs(discrepancies.difference - np.median(discrepancies.difference[is_used], axis=0))
-    for group in groups_used:
+    for group in estimated_groups:
         sigma[group] = max(
             NORMAL_SIGMA_BY_MAD * np.median(start[group & is_used[:, None]]), assumed
         )
@@ -284,23 +294,25 @@ def _resolve(
     # its own σ of 10 to 40 % deserves, and after 200 rounds the last one is good enough.
     for number in range(200):
         W, d, rows = _weight_matrix(discrepancies, sigma, is_used)
-        Wd, previous = W @ d, sigma.copy()
-        for group in groups_used:
-            is_of_group = group.ravel()[rows]
-            trace = np.diag(W)[is_of_group].sum()
+        Wd, previous_sigma = W @ d, sigma.copy()
+        for group in estimated_groups:
+            group_rows = group.ravel()[rows]
+            trace = np.diag(W)[group_rows].sum()
             if trace > 0:
-                s = sigma[group][0] * np.sqrt((Wd[is_of_group] ** 2).sum() / trace)
+                s = sigma[group][0] * np.sqrt((Wd[group_rows] ** 2).sum() / trace)
                 sigma[group] = max(s, assumed)
             if number == 0:
                 # With a σ that dominates C; where the estimate is small, its share is hardly any.
-                redundancy[0 if group[:, :2].any() else 1] = float(previous[group][0] ** 2 * trace)
-        if np.abs(sigma[unknown] / previous[unknown] - 1).max() < 1e-3:
+                redundancy[0 if group[:, :2].any() else 1] = float(
+                    previous_sigma[group][0] ** 2 * trace
+                )
+        if np.abs(sigma[is_unknown] / previous_sigma[is_unknown] - 1).max() < 1e-3:
             break
     plane, height = (
         bool(g.any()) and (r < MIN_REDUNDANCY or bool(np.all(sigma[g] <= assumed)))
         for g, r in zip(groups, redundancy)
     )
-    for group, is_few in zip(groups, (plane, height)):
-        if is_few:
+    for group, is_assumed in zip(groups, (plane, height)):
+        if is_assumed:
             sigma[group] = assumed
     return sigma, (redundancy[0], redundancy[1]), (plane, height)

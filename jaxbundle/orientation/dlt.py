@@ -105,9 +105,9 @@ def decompose(P: Float[AnyArray, "3 4"]) -> tuple[CameraWithPose, Int[Array, ""]
     fy = jnp.linalg.norm(b - y0 * m3)
     m2 = -(b - y0 * m3) / fy
     skew = -a @ m2
-    orthogonal_part = a - x0 * m3 + skew * m2
-    fx = jnp.linalg.norm(orthogonal_part)
-    M = jnp.stack([-orthogonal_part / fx, m2, m3])
+    scaled_m1 = a - x0 * m3 + skew * m2
+    fx = jnp.linalg.norm(scaled_m1)
+    M = jnp.stack([-scaled_m1 / fx, m2, m3])
     X0 = -jnp.linalg.solve(A[:, :3], A[:, 3])
     camera = CameraWithPose(
         jnp.stack([fx, fy, skew, x0, y0]), jnp.zeros(0, P.dtype), CameraPose(X0, M)
@@ -128,10 +128,8 @@ def refine_camera(
     all parameters.
     """
     p = ones_unless(weights, xy)
-    number_missing = radial - camera.radial.shape[0]
-    start = CameraWithPose(
-        camera.interior, jnp.pad(camera.radial, (0, number_missing)), camera.pose
-    )
+    added_terms = radial - camera.radial.shape[0]
+    start = CameraWithPose(camera.interior, jnp.pad(camera.radial, (0, added_terms)), camera.pose)
     data = (xy, X, jnp.sqrt(p))
     fit = adjust(_misclosures, _retract, start, data, 11 + radial)
     behind = jax.vmap(to_camera, (None, 0))(fit.estimate.pose, X)[:, 2] >= 0

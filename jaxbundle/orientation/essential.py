@@ -87,10 +87,10 @@ def five_solutions(
     times_x = jnp.asarray(_TAKE_CUBIC) @ -reduced + jnp.asarray(_TAKE_BASIS)
     x, vectors = jnp.linalg.eig(jnp.where(jnp.isfinite(times_x), times_x, 0))
     # An eigenvector holds the values of the basis at a solution: its last entries are x, y, z, 1.
-    scale = vectors[9]
-    xyz = vectors[6:9] / jnp.where(jnp.abs(scale) > 0, scale, 1)
+    w = vectors[9]
+    xyz = vectors[6:9] / jnp.where(jnp.abs(w) > 0, w, 1)
     size = 1 + jnp.sum(jnp.abs(xyz), 0)
-    usable = (jnp.abs(scale) > 0) & jnp.all(jnp.isfinite(times_x))
+    usable = (jnp.abs(w) > 0) & jnp.all(jnp.isfinite(times_x))
     # Rounding moves a double root by the root of 1e-16, 1e-8 of its length, off the real axis;
     # 1e-6 leaves room for the elimination before. Truly complex pairs of noisy points are farther
     # off, and serve as start values in `relative_orientation` all the same.
@@ -114,8 +114,8 @@ def _to_normalised(
 ) -> Float[Array, "3 3"]:
     """T with T·(x, y, −1) = (x', y', −1), of mean 0 and mean square 1 a coordinate."""
     (x, y), size = normalisation(xy, weights)
-    nil, unit = jnp.zeros_like(x), jnp.ones_like(x)
-    return jnp.array([[unit / size, nil, x / size], [nil, unit / size, y / size], [nil, nil, unit]])
+    nil, one = jnp.zeros_like(x), jnp.ones_like(x)
+    return jnp.array([[one / size, nil, x / size], [nil, one / size, y / size], [nil, nil, one]])
 
 
 def _coplanarity(
@@ -135,29 +135,29 @@ def _cubic_equations(space: Float[Array, "4 3 3"]) -> Float[Array, "10 20"]:
     """Coefficients [10, 20] of 2·E·Eᵀ·E − tr(E·Eᵀ)·E and det E, `_CUBIC` and `_BASIS`."""
     square = jnp.einsum("aij,bkj->ikab", space, space)
     trace = jnp.einsum("iiab->ab", square)
-    nine = 2 * jnp.einsum("ikab,ckj->ijabc", square, space)
-    nine = (nine - jnp.einsum("ab,cij->ijabc", trace, space)).reshape(9, 64)
+    nine_equations = 2 * jnp.einsum("ikab,ckj->ijabc", square, space)
+    nine_equations = (nine_equations - jnp.einsum("ab,cij->ijabc", trace, space)).reshape(9, 64)
     determinant = jnp.einsum("aj,bk,cl,jkl->abc", *space.swapaxes(0, 1), _PERMUTATION)
-    return jnp.concatenate([nine, determinant.reshape(1, 64)]) @ jnp.asarray(_COLLECT)
+    return jnp.concatenate([nine_equations, determinant.reshape(1, 64)]) @ jnp.asarray(_COLLECT)
 
 
 def _collect() -> Float[np.ndarray, "64 20"]:
     """Sums the products of three of (x, y, z, 1) that are the same monomial [64, 20]."""
     monomials = _CUBIC + _BASIS
-    out = np.zeros((64, 20))
+    selection = np.zeros((64, 20))
     for row, factors in enumerate(product(range(4), repeat=3)):
         powers = factors.count(0), factors.count(1), factors.count(2)
-        out[row, monomials.index(powers)] = 1
-    return out
+        selection[row, monomials.index(powers)] = 1
+    return selection
 
 
 def _times_x() -> tuple[Float[np.ndarray, "10 10"], Float[np.ndarray, "10 10"]]:
     """Where x times the basis is found: among the cubic monomials, or in the basis again."""
     cubic, basis = np.zeros((10, 10)), np.zeros((10, 10))
     for row, (i, j, k) in enumerate(_BASIS):
-        monomial = (i + 1, j, k)
-        table, names = (cubic, _CUBIC) if sum(monomial) == 3 else (basis, _BASIS)
-        table[row, names.index(monomial)] = 1
+        product_powers = (i + 1, j, k)
+        table, names = (cubic, _CUBIC) if sum(product_powers) == 3 else (basis, _BASIS)
+        table[row, names.index(product_powers)] = 1
     return cubic, basis
 
 

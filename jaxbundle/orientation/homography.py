@@ -85,7 +85,7 @@ def interior_from_homographies(
     p = ones_unless(weights, H)
     H = jnp.diag(jnp.array([1 / size, 1 / size, 1.0])) @ H
     H = H / jnp.linalg.norm(H, axis=(1, 2), keepdims=True)
-    v = jax.vmap(_products, (0, None, None))
+    v = jax.vmap(_coefficients_of_product, (0, None, None))
     rows = jnp.concatenate([v(H, 0, 1), v(H, 0, 0) - v(H, 1, 1)]) * jnp.tile(p, 2)[:, None]
     columns = jnp.array([0, 1, 2, 3, 4, 5] if skew else [0, 2, 3, 4, 5])
     b, singular = null_vector(rows[:, columns])
@@ -110,27 +110,27 @@ def pose_from_homography(H: Float[AnyArray, "3 3"], interior: Float[AnyArray, "5
     first two axes are made perpendicular, the error shared.
     """
     fx, fy, s, x0, y0 = interior
-    nil, unit_scale = jnp.zeros_like(fx), jnp.ones_like(fx)
-    K = jnp.array([[fx, s, x0], [nil, fy, y0], [nil, nil, unit_scale]])
+    nil, one = jnp.zeros_like(fx), jnp.ones_like(fx)
+    K = jnp.array([[fx, s, x0], [nil, fy, y0], [nil, nil, one]])
     A = jnp.diag(jnp.array([1.0, 1.0, -1.0])) @ jnp.linalg.solve(K, H)
     length = jnp.linalg.norm(A[:, :2], axis=0)
     unit = lambda a: a / jnp.linalg.norm(a)
-    axis_1, axis_2 = (A[:, :2] / length).T
+    x_axis, y_axis = (A[:, :2] / length).T
     # The bisectors of two unit vectors are perpendicular; so are the vectors at 45° to them, each
     # turned by half of the error.
-    p, q = unit(axis_1 + axis_2), unit(axis_1 - axis_2)
-    axis_1, axis_2 = (p + q) / jnp.sqrt(2.0), (p - q) / jnp.sqrt(2.0)
-    M = jnp.stack([axis_1, axis_2, jnp.cross(axis_1, axis_2)], 1)
+    p, q = unit(x_axis + y_axis), unit(x_axis - y_axis)
+    x_axis, y_axis = (p + q) / jnp.sqrt(2.0), (p - q) / jnp.sqrt(2.0)
+    M = jnp.stack([x_axis, y_axis, jnp.cross(x_axis, y_axis)], 1)
     return CameraPose(-M.T @ A[:, 2] * 2 / jnp.sum(length), M)
 
 
 def _similarity(scale: Float[Array, ""], shift: Float[Array, "2"]) -> Float[Array, "3 3"]:
     """The matrix of scale·[x, y] + shift in homogeneous coordinates."""
-    nil, unit = jnp.zeros_like(scale), jnp.ones_like(scale)
-    return jnp.array([[scale, nil, shift[0]], [nil, scale, shift[1]], [nil, nil, unit]])
+    nil, one = jnp.zeros_like(scale), jnp.ones_like(scale)
+    return jnp.array([[scale, nil, shift[0]], [nil, scale, shift[1]], [nil, nil, one]])
 
 
-def _products(H: Float[AnyArray, "3 3"], i: int, j: int) -> Float[Array, "6"]:
+def _coefficients_of_product(H: Float[AnyArray, "3 3"], i: int, j: int) -> Float[Array, "6"]:
     """hᵢᵀ·B·hⱼ as the coefficients of (B11, B12, B22, B13, B23, B33)."""
     a, b = H[:, i], H[:, j]
     return jnp.stack(

@@ -18,7 +18,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import Model, misclosures
-from jaxbundle.orientation.rays import sights
+from jaxbundle.orientation.rays import make_sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
 # The symmetry of the expected convention: a 2 × 2 matrix, row by row.
@@ -38,7 +38,7 @@ EXPECTED_CONVENTION = {
 }
 
 
-def explains_better(misfit: float, misfit_as_given: float) -> bool:
+def explains_better(misfit: float, given_misfit: float) -> bool:
     """Whether another convention explains the same data so much better that it is theirs: its
     misfit, the RMS or median of their residuals, is a fifth of that of the given convention.
 
@@ -48,7 +48,7 @@ def explains_better(misfit: float, misfit_as_given: float) -> bool:
     start values, a few hundredths of it, or by those of measurements. A similar misfit says
     nothing: nearly plane objects fit their mirror image.
     """
-    return 5 * misfit < misfit_as_given
+    return 5 * misfit < given_misfit
 
 
 def name_image_convention(network: Network, settings: StartValueSettings = DEFAULTS) -> str:
@@ -56,33 +56,33 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     expected one does, or no other."""
     images, points, rays = network.images, network.points, network.observations
     placed = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
-    is_known = np.all(np.isfinite(points.position), axis=1)
-    rows = np.flatnonzero(placed[rays.image] & is_known[rays.point])
+    has_coordinates = np.all(np.isfinite(points.position), axis=1)
+    rows = np.flatnonzero(placed[rays.image] & has_coordinates[rays.point])
     if not len(rows):
         return ""
     # The median of 2000 is known to 3 % of its spread (1.25/√n): more than enough to recognise a
     # factor of ten, of up to sixteen conventions.
     rows = rows[batched.evenly_spaced(len(rows), 2000)]
-    some = network.replace(observations=rays.take(rows))
+    sample = network.replace(observations=rays.take(rows))
     centres, halves = (np.array(v) for v in zip(*(image_frame(c) for c in network.cameras)))
-    camera = images.camera[some.observations.image]
-    missed: dict[tuple[tuple[int, int, int, int], bool], float]
-    missed = {(IDENTITY, False): _misclosure(some, placed, is_known)}
-    if missed[IDENTITY, False] <= settings.gross_ratio:
+    camera = images.camera[sample.observations.image]
+    medians: dict[tuple[tuple[int, int, int, int], bool], float]
+    medians = {(IDENTITY, False): _misclosure(sample, placed, has_coordinates)}
+    if medians[IDENTITY, False] <= settings.gross_ratio:
         return ""
     m, half_size = centres[camera], halves[camera]
     for symmetry, shifted in itertools.product([IDENTITY, *SYMMETRIES], [False, True]):
-        if (symmetry, shifted) in missed or shifted and not np.isfinite(half_size).all():
+        if (symmetry, shifted) in medians or shifted and not np.isfinite(half_size).all():
             continue
         # Centred coordinates instead of those from a corner, or the other way round.
         middle = np.where(m == 0, half_size, 0.0) if shifted else m
-        xy = (some.observations.xy - middle) @ np.reshape(symmetry, (2, 2)).T + m
-        changed = dataclasses.replace(some.observations, xy=xy)
-        missed[symmetry, shifted] = _misclosure(
-            some.replace(observations=changed), placed, is_known
+        xy = (sample.observations.xy - middle) @ np.reshape(symmetry, (2, 2)).T + m
+        changed = dataclasses.replace(sample.observations, xy=xy)
+        medians[symmetry, shifted] = _misclosure(
+            sample.replace(observations=changed), placed, has_coordinates
         )
-    best = min(missed, key=lambda k: missed[k])  # The expected one, and simple ones, come first.
-    if not explains_better(missed[best], missed[IDENTITY, False]):
+    best = min(medians, key=lambda k: medians[k])  # The expected one, and simple ones, come first.
+    if not explains_better(medians[best], medians[IDENTITY, False]):
         return ""
     unit = get_model(network.cameras[0].model).unit
     x, y = ("u", "v") if unit == "px" else ("x", "y")
@@ -116,42 +116,42 @@ def image_frame(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarra
 
 
 def _misclosure(
-    network: Network, placed: Bool[np.ndarray, " images"], is_known: Bool[np.ndarray, " points"]
+    network: Network,
+    placed: Bool[np.ndarray, " images"],
+    has_coordinates: Bool[np.ndarray, " points"],
 ) -> float:
     """The median misclosure of start values, in tolerances; infinite if half have no ray."""
-    sighted, images = sights(network), network.images
-    if 2 * len(sighted.row) < len(network.observations):
+    sights, images = make_sights(network), network.images
+    if 2 * len(sights.row) < len(network.observations):
         return np.inf
-    model = Model.empty(sighted)
+    model = Model.empty(sights)
     model.place(placed, images.position[placed], batched.matrices(images.angles[placed]))
-    model.X[is_known] = network.points.position[is_known]
-    return float(np.median(misclosures(sighted, model) / sighted.tolerance[sighted.image]))
+    model.X[has_coordinates] = network.points.position[has_coordinates]
+    return float(np.median(misclosures(sights, model) / sights.tolerance[sights.image]))
 
 
 def name_image_extent(network: Network) -> str:
     """Whether image coordinates lie where no image is, in words: another origin, or unit."""
-    camera = network.images.camera[network.observations.image]
-    for c, camera_of_network in enumerate(network.cameras):
-        xy = network.observations.xy[camera == c]
-        centre, half_size = image_frame(camera_of_network)
+    camera_of_ray = network.images.camera[network.observations.image]
+    for c, camera in enumerate(network.cameras):
+        xy = network.observations.xy[camera_of_ray == c]
+        centre, half_size = image_frame(camera)
         if not len(xy):
             continue
-        unit = get_model(camera_of_network.model).unit
+        unit = get_model(camera.model).unit
         low, high = np.quantile(xy, [0.01, 0.99], axis=0)
         if not np.isfinite(half_size).all():
             # Six points are in one quadrant of an image by chance once in 4⁵ = 1000 times.
             if unit == "mm" and len(xy) >= 6 and ((low > 0).all() or (high < 0).all()):
                 return (
-                    f"camera {camera_of_network.id!r}: the image coordinates run from "
-                    f"{low[0]:.4g}, "
+                    f"camera {camera.id!r}: the image coordinates run from {low[0]:.4g}, "
                     f"{low[1]:.4g} to {high[0]:.4g}, {high[1]:.4g} mm, all on one side of the "
                     "image centre: are they counted from a corner? Expected are "
                     f"{EXPECTED_CONVENTION[unit]}"
                 )
             continue
-        finding = (
-            f"camera {camera_of_network.id!r}: the image coordinates run from {low[0]:.4g}, "
-            f"{low[1]:.4g} to "
+        description = (
+            f"camera {camera.id!r}: the image coordinates run from {low[0]:.4g}, {low[1]:.4g} to "
             f"{high[0]:.4g}, {high[1]:.4g} {unit}, where the image is from "
             f"{(centre - half_size)[0]:.4g}, {(centre - half_size)[1]:.4g} to "
             f"{(centre + half_size)[0]:.4g}, {(centre + half_size)[1]:.4g}"
@@ -159,15 +159,15 @@ def name_image_extent(network: Network) -> str:
         # In mm all points lie within 2 % of the image about its first pixel: a sensor of 36 mm has
         # 2000 columns and more.
         if unit == "px" and (np.abs([low, high]) < 0.02 * 2 * half_size).all():
-            return f"{finding}: are they in mm? Expected are {EXPECTED_CONVENTION[unit]}"
+            return f"{description}: are they in mm? Expected are {EXPECTED_CONVENTION[unit]}"
         # Of coordinates from the centre, taken for coordinates from a corner, three quarters lie
         # outside the image; blunders are fewer than a quarter.
-        share_outside = (np.abs(xy - centre) > half_size).any(1).mean()
+        outside_share = (np.abs(xy - centre) > half_size).any(1).mean()
         shifted = np.where(centre == 0, half_size, 0.0)
-        if share_outside > 0.25 and (np.abs(xy - shifted) <= half_size).all(1).mean() > 0.99:
+        if outside_share > 0.25 and (np.abs(xy - shifted) <= half_size).all(1).mean() > 0.99:
             origin = "the image centre" if unit == "px" else "a corner of the image"
             return (
-                f"{finding}: are they counted from {origin}? Expected are "
+                f"{description}: are they counted from {origin}? Expected are "
                 f"{EXPECTED_CONVENTION[unit]}"
             )
     return ""

@@ -103,12 +103,12 @@ def are_held(
     control (`extent_to_misfit`). Less exact ones, such as those of handheld receivers, are
     intersected like tie points; with them the model is moved to control, but no ray contradicts
     them."""
-    is_known = are_controlled(points)
-    if is_known.sum() < 3:  # they have no extent to compare with
-        return is_known
-    extent = np.ptp(points.position[is_known], axis=0).max()
+    is_controlled = are_controlled(points)
+    if is_controlled.sum() < 3:  # they have no extent to compare with
+        return is_controlled
+    extent = np.ptp(points.position[is_controlled], axis=0).max()
     sigma = np.where(points.has_role("fixed")[:, None], 0.0, np.nan_to_num(points.sigma))
-    return is_known & (sigma.max(1) * settings.extent_to_misfit <= extent)
+    return is_controlled & (sigma.max(1) * settings.extent_to_misfit <= extent)
 
 
 # Adjusts the images and points of a model among themselves, in place.
@@ -129,32 +129,34 @@ def grow(
     cost less than twice the last one."""
     candidates = np.ones(sights.images, bool) if candidates is None else candidates
     # Known points at the last try: an image is tried again only when it has more.
-    known_when_tried = np.zeros(sights.images, int)
-    due = max(settings.first_improvement, settings.improvement_growth * model.placed.sum())
+    last_counts = np.zeros(sights.images, int)
+    next_improvement = max(
+        settings.first_improvement, settings.improvement_growth * model.placed.sum()
+    )
     intersect(sights, model, RESECTION_LIMITS)
     while True:
-        number_known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
+        known_counts = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
         is_waiting = (
             candidates
             & ~model.placed
-            & (number_known >= settings.min_points)
-            & (number_known > known_when_tried)
+            & (known_counts >= settings.min_points)
+            & (known_counts > last_counts)
         )
         if not is_waiting.any():
             break
         # Several at a time, those with the most points first; on repeated structures the images
         # with few points are those most easily placed wrongly, and later they have more.
-        largest_number = number_known[is_waiting].max()
-        sufficient = min(
-            max(settings.sufficient_points, settings.waiting_share * largest_number), largest_number
+        max_count = known_counts[is_waiting].max()
+        sufficient_count = min(
+            max(settings.sufficient_points, settings.waiting_share * max_count), max_count
         )
-        images = np.flatnonzero(is_waiting & (number_known >= sufficient))
-        known_when_tried[images] = number_known[images]
-        if _place_images(sights, model, images, settings):
+        selected = np.flatnonzero(is_waiting & (known_counts >= sufficient_count))
+        last_counts[selected] = known_counts[selected]
+        if _place_images(sights, model, selected, settings):
             intersect(sights, model, RESECTION_LIMITS)
-        if improve is not None and model.placed.sum() >= due:
+        if improve is not None and model.placed.sum() >= next_improvement:
             improve(sights, model)
-            due = settings.improvement_growth * model.placed.sum()
+            next_improvement = settings.improvement_growth * model.placed.sum()
 
 
 def finish(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS) -> None:
@@ -162,9 +164,9 @@ def finish(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS
     # Twice: the second time images are refined by points that already come from refined images.
     # More passes would approach what the adjustment computes anyway.
     for _ in range(2):
-        intersect(sights, model, START_VALUE_LIMITS, again=True)
+        intersect(sights, model, START_VALUE_LIMITS, repeat=True)
         _refine(sights, model, settings)
-    intersect(sights, model, START_VALUE_LIMITS, again=True)
+    intersect(sights, model, START_VALUE_LIMITS, repeat=True)
 
 
 def place_far_points(sights: Sights, model: Model, settings: StartValueSettings = DEFAULTS) -> None:
@@ -179,15 +181,15 @@ def place_far_points(sights: Sights, model: Model, settings: StartValueSettings 
     np.add.at(direction, point, ray)
     number = np.bincount(point, minlength=sights.points)
     direction /= np.where(number > 0, np.linalg.norm(direction, axis=1), 1.0)[:, None]
-    widest = np.zeros(sights.points)
-    np.fmax.at(widest, point, np.linalg.norm(np.cross(ray, direction[point]), axis=1))
-    is_far = (number >= 3) & (widest < settings.parallel_angle) & ~model.control
+    max_sine = np.zeros(sights.points)
+    np.fmax.at(max_sine, point, np.linalg.norm(np.cross(ray, direction[point]), axis=1))
+    is_far = (number >= 3) & (max_sine < settings.parallel_angle) & ~model.control
     if not is_far.any() or 2 * is_far.sum() > model.known.sum():
         return
     centres = model.X0[model.placed]
     middle = centres.mean(0)
-    spread_of_stations = np.sqrt(((centres - middle) ** 2).sum(1).mean())
-    model.X[is_far] = middle + settings.far_distance * spread_of_stations * direction[is_far]
+    rms_radius = np.sqrt(((centres - middle) ** 2).sum(1).mean())
+    model.X[is_far] = middle + settings.far_distance * rms_radius * direction[is_far]
     model.known[is_far] = True
 
 
@@ -219,18 +221,18 @@ def _in_planes(
 ]:
     """For each of the images with enough known points: their rows, and their coordinates in a
     camera turned by R (`sights.in_plane`)."""
-    usable, rows_of_images, R, xy = [], [], [], []
+    usable, image_rows, R, xy = [], [], [], []
     for image in images:
         rows = np.arange(sights.image.size)[sights.rows_of(image)]
         rows = rows[model.known[sights.point[rows]]]
-        turn, in_image_plane = in_plane(sights.ray[rows])
-        is_finite = np.isfinite(in_image_plane).all(1)
+        turn, coordinates = in_plane(sights.ray[rows])
+        is_finite = np.isfinite(coordinates).all(1)
         if is_finite.sum() >= settings.min_points:
             usable.append(image)
-            rows_of_images.append(rows[is_finite])
+            image_rows.append(rows[is_finite])
             R.append(turn)
-            xy.append(in_image_plane[is_finite])
-    return np.array(usable, int), rows_of_images, np.reshape(R, (-1, 3, 3)), xy
+            xy.append(coordinates[is_finite])
+    return np.array(usable, int), image_rows, np.reshape(R, (-1, 3, 3)), xy
 
 
 def _refine(sights: Sights, model: Model, settings: StartValueSettings) -> None:
@@ -238,19 +240,21 @@ def _refine(sights: Sights, model: Model, settings: StartValueSettings) -> None:
     error = misclosures(sights, model)
     images, rows, R, xy = _in_planes(sights, model, np.flatnonzero(model.placed), settings)
     weights = [(error[r] < sights.tolerance[i]).astype(float) for r, i in zip(rows, images)]
-    # Of the rows that `many` uses: an image whose good points are not among these would be refined
-    # by none.
-    use = [
-        k for k, w in enumerate(weights) if w[batched.evenly_spaced(len(w))].sum() >= settings.min_points
+    # Of the rows that `batched.refine` uses: an image whose good points are not among these would
+    # be refined by none.
+    usable = [
+        k
+        for k, w in enumerate(weights)
+        if w[batched.evenly_spaced(len(w))].sum() >= settings.min_points
     ]
-    if not use:
+    if not usable:
         return
-    images, rows, R = images[use], [rows[k] for k in use], R[use]
+    images, rows, R = images[usable], [rows[k] for k in usable], R[usable]
     model.X0[images], M = batched.refine(
         (model.X0[images], R @ model.M[images]),
-        [xy[k] for k in use],
+        [xy[k] for k in usable],
         [model.X[sights.point[r]] for r in rows],
-        [weights[k] for k in use],
+        [weights[k] for k in usable],
     )
     model.M[images] = R.swapaxes(1, 2) @ M
 
@@ -260,63 +264,60 @@ def misclosures(sights: Sights, model: Model) -> Float[np.ndarray, " n"]:
     behind the ray, NaN if not placed."""
     to_point = model.X[sights.point] - model.X0[sights.image]
     ray = np.einsum("nij,ni->nj", model.M[sights.image], sights.ray)
-    depth = (to_point * ray).sum(1)
+    distance = (to_point * ray).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.linalg.norm(np.cross(to_point, ray), axis=1) / depth
-    return np.where(depth <= 0, np.inf, error)
+        error = np.linalg.norm(np.cross(to_point, ray), axis=1) / distance
+    return np.where(distance <= 0, np.inf, error)
 
 
 def intersect(
-    sights: Sights, model: Model, limits: IntersectionLimits, again: bool = False
+    sights: Sights, model: Model, limits: IntersectionLimits, repeat: bool = False
 ) -> None:
-    """Intersect the points that are not known yet, or all that are not held `again`.
+    """Intersect the points that are not known yet; with `repeat`, all that are not held.
 
     If the rays of a point disagree, the worst ray is dropped, as long as two remain.
     """
     rows = np.flatnonzero(model.placed[sights.image])
     rows = rows[np.argsort(sights.point[rows], kind="stable")]
     point = sights.point[rows]
-    first_ray = np.searchsorted(point, np.arange(sights.points))
+    starts = np.searchsorted(point, np.arange(sights.points))
     number = np.bincount(point, minlength=sights.points)
-    points_to_intersect = np.flatnonzero((number >= 2) & ~model.control & (again | ~model.known))
-    if not len(points_to_intersect):
+    selected_points = np.flatnonzero((number >= 2) & ~model.control & (repeat | ~model.known))
+    if not len(selected_points):
         return
-    place = np.minimum(np.arange(batched.RAYS), number[points_to_intersect, None] - 1)
-    scale = np.maximum((number[points_to_intersect, None] - 1) / (batched.RAYS - 1), 1.0)
-    row = rows[first_ray[points_to_intersect, None] + (place * scale).astype(int)]
-    weights = (np.arange(batched.RAYS) < number[points_to_intersect, None]).astype(float)
+    place = np.minimum(np.arange(batched.RAYS), number[selected_points, None] - 1)
+    scale = np.maximum((number[selected_points, None] - 1) / (batched.RAYS - 1), 1.0)
+    row = rows[starts[selected_points, None] + (place * scale).astype(int)]
+    weights = (np.arange(batched.RAYS) < number[selected_points, None]).astype(float)
     X0 = model.X0[sights.image[row]]
     rays = np.einsum("nkij,nki->nkj", model.M[sights.image[row]], sights.ray[row])
     tolerance = limits.max_miss * sights.tolerance[sights.image[row]]
 
-    X, good = (
-        np.full((len(points_to_intersect), 3), np.nan),
-        np.zeros(len(points_to_intersect), bool),
-    )
-    todo = np.arange(len(points_to_intersect))
+    X, good = np.full((len(selected_points), 3), np.nan), np.zeros(len(selected_points), bool)
+    todo = np.arange(len(selected_points))
     while len(todo):
-        intersected, angle, status = batched.intersect(X0[todo], rays[todo], weights[todo])
-        misclosure = (
-            _tangent_of_angle(intersected[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
+        new_X, angle, status = batched.intersect(X0[todo], rays[todo], weights[todo])
+        relative_misclosures = (
+            _angle_tangents(new_X[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
         )
         sound = status == int(Status.SOUND)
-        agree = sound & (misclosure.max(1) < 1)
-        X[todo], good[todo] = intersected, agree & (angle > limits.min_angle)
+        agrees = sound & (relative_misclosures.max(1) < 1)
+        X[todo], good[todo] = new_X, agrees & (angle > limits.min_angle)
         # One ray a round: the worst one draws the point to itself, so that good rays miss it as
         # well. Of two contradicting rays either may be wrong.
-        has_outlier = ~agree & (weights[todo].sum(1) > 2) & np.isfinite(misclosure).all(1)
-        weights[todo[has_outlier], misclosure[has_outlier].argmax(1)] = 0.0
-        todo = todo[has_outlier]
-    model.known[points_to_intersect] = good
-    model.X[points_to_intersect] = np.where(good[:, None], X, np.nan)
+        continued = ~agrees & (weights[todo].sum(1) > 2) & np.isfinite(relative_misclosures).all(1)
+        weights[todo[continued], relative_misclosures[continued].argmax(1)] = 0.0
+        todo = todo[continued]
+    model.known[selected_points] = good
+    model.X[selected_points] = np.where(good[:, None], X, np.nan)
 
 
-def _tangent_of_angle(
+def _angle_tangents(
     d: Float[np.ndarray, "n rays 3"], rays: Float[np.ndarray, "n rays 3"]
 ) -> Float[np.ndarray, "n rays"]:
     """Tangent of the angle between a direction and a unit ray; 1000, above all tolerances but
     finite (a ray from there is dropped like others), if it points backwards."""
-    depth = np.einsum("nkj,nkj->nk", d, rays)
-    distance = np.linalg.norm(np.cross(d, rays), axis=-1)
+    parallel = np.einsum("nkj,nkj->nk", d, rays)
+    perpendicular = np.linalg.norm(np.cross(d, rays), axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(depth > 0, distance / depth, 1e3)
+        return np.where(parallel > 0, perpendicular / parallel, 1e3)

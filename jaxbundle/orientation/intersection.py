@@ -60,19 +60,19 @@ def intersection(
     # The least eigenvalue of N is p·angle²/2 of two rays: 5e-15·p at 1e-7 rad, of which rounding
     # (1e-16) leaves one or two figures. Directions are measured to 1e-6 rad at best.
     parallel = angle < 1e-7
-    projection_across = jnp.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None, :]
-    N = jnp.einsum("n,nij->ij", p, projection_across)
+    projectors = jnp.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None, :]
+    N = jnp.einsum("n,nij->ij", p, projectors)
     # Relative to the mean centre: with map coordinates in the millions g would lose their figures.
     middle = p @ X0 / jnp.sum(p)
-    g = jnp.einsum("n,nij,nj->i", p, projection_across, X0 - middle)
+    g = jnp.einsum("n,nij,nj->i", p, projectors, X0 - middle)
     start = jnp.linalg.solve(jnp.where(parallel, jnp.eye(3, dtype=d.dtype), N), g) + middle
     data = (X0, d, jnp.sqrt(p))
     fit = adjust(_misclosures, jnp.add, start, data, 3)
-    depth = jnp.einsum("ni,ni->n", d, fit.estimate - X0)
+    distances = jnp.einsum("ni,ni->n", d, fit.estimate - X0)
     status = first_of(
         (parallel, Status.PARALLEL_RAYS),
         (~fit.determined, Status.UNDETERMINED),
-        (jnp.any((depth <= 0) & (p > 0)), Status.BEHIND_THE_CAMERA),
+        (jnp.any((distances <= 0) & (p > 0)), Status.BEHIND_THE_CAMERA),
     )
     cofactor = jnp.where(parallel, jnp.inf, fit.cofactor)
     return Intersection(fit.estimate, fit.vtpv, cofactor, angle, status)

@@ -81,6 +81,6 @@ def _right_singular(
     A: Float[AnyArray, "rows n"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Singular values and all right singular vectors: empty rows are added to a flat matrix."""
-    missing_rows = max(A.shape[1] - A.shape[0], 0)
-    _, s, Vt = jnp.linalg.svd(jnp.pad(A, ((0, missing_rows), (0, 0))), full_matrices=False)
+    empty_rows = max(A.shape[1] - A.shape[0], 0)
+    _, s, Vt = jnp.linalg.svd(jnp.pad(A, ((0, empty_rows), (0, 0))), full_matrices=False)
     return s, Vt

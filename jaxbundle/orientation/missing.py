@@ -14,9 +14,7 @@ from jaxbundle.orientation.rays import Sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
 
-def note_missing(
-    network: Network, noun: str, reasons: Mapping[str, str], beginning: str
-) -> Network:
+def note_missing(network: Network, noun: str, reasons: Mapping[str, str], clause: str) -> Network:
     """The network with notes that images or points were left out, by name with the reasons."""
     if not reasons:
         return network
@@ -25,23 +23,23 @@ def note_missing(
         why: tuple(id for id, reason in reasons.items() if reason == why)
         for why in dict.fromkeys(reasons.values())
     }
-    network = network.note(f"left out {count(len(reasons), noun)} {beginning}: {names}")
-    notes = (LeftOut(noun, ids, f"{beginning}: {why}") for why, ids in groups.items())
+    network = network.note(f"left out {count(len(reasons), noun)} {clause}: {names}")
+    notes = (LeftOut(noun, ids, f"{clause}: {why}") for why, ids in groups.items())
     return network.replace(left_out=(*network.left_out, *notes))
 
 
 def explain_missing(
     network: Network,
-    sighted: Sights,
+    sights: Sights,
     model: Model,
     is_known: Bool[np.ndarray, " points"],
     settings: StartValueSettings = DEFAULTS,
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """By id, why images are not placed, and why points are not `is_known`."""
-    rays = np.bincount(sighted.image, minlength=sighted.images)
-    of_known = np.bincount(
-        sighted.image, model.known[sighted.point], minlength=sighted.images
-    ).astype(int)
+    """By id, why images are not placed, and why points are not known (`is_known`)."""
+    rays = np.bincount(sights.image, minlength=sights.images)
+    of_known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images).astype(
+        int
+    )
     images = {}
     for image in np.flatnonzero(~model.placed):
         if of_known[image] < settings.min_points:
@@ -56,11 +54,11 @@ def explain_missing(
                 "principal distance"
             )
         images[network.images.id[image]] = why
-    placed = model.placed[sighted.image]
-    by_point = np.bincount(sighted.point[placed], minlength=sighted.points)
-    without_ray = np.ones(len(network.observations), bool)
-    without_ray[sighted.row] = False
-    no_ray = np.bincount(network.observations.point[without_ray], minlength=sighted.points)
+    placed = model.placed[sights.image]
+    by_point = np.bincount(sights.point[placed], minlength=sights.points)
+    lacks_ray = np.ones(len(network.observations), bool)
+    lacks_ray[sights.row] = False
+    no_ray = np.bincount(network.observations.point[lacks_ray], minlength=sights.points)
     points = {}
     for point in np.flatnonzero(~is_known):
         if by_point[point] < 2 and no_ray[point]:

@@ -44,7 +44,7 @@ from jaxbundle.orientation.incremental import (
     place_far_points,
 )
 from jaxbundle.orientation.missing import explain_missing, note_missing
-from jaxbundle.orientation.rays import TOLERANCE, Sights, sights
+from jaxbundle.orientation.rays import TOLERANCE, Sights, make_sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.orientation.start_pairs import all_pairs, good_pairs
 from jaxbundle.orientation.swapped_control import name_contradiction, name_suspects
@@ -96,10 +96,11 @@ class Oriented(TableMethods):
         }
 
     def __str__(self) -> str:
-        placed, number_known = len(self.network.images), len(self.network.points)
+        image_count, point_count = len(self.network.images), len(self.network.points)
         lines = [
-            f"placed {count(placed, 'image')} of {placed + len(self.images_not_placed)} and "
-            f"{count(number_known, 'point')} of {number_known + len(self.points_not_placed)}, "
+            f"placed {count(image_count, 'image')} of "
+            f"{image_count + len(self.images_not_placed)} and "
+            f"{count(point_count, 'point')} of {point_count + len(self.points_not_placed)}, "
             f"{self.frame}"
         ]
         for noun, reasons in (
@@ -137,12 +138,12 @@ def without_placeholders(network: Network) -> Network:
     tie = points.has_role("tie")
     if tie.sum() > 1 and (X[tie] == X[tie][0]).all():
         messages.append(
-            f"all {int(tie.sum())} tie points have one start value, {_numbers(X[tie][0])}"
+            f"all {int(tie.sum())} tie points have one start value, {_format_numbers(X[tie][0])}"
         )
         X = np.where(tie[:, None], np.nan, X)
     pose = np.concatenate([position, angles], 1)
     if len(pose) > 1 and np.isnan(images.sigma).all() and (pose == pose[0]).all():
-        messages.append(f"all {len(pose)} images have one start value, {_numbers(pose[0])}")
+        messages.append(f"all {len(pose)} images have one start value, {_format_numbers(pose[0])}")
         position, angles = np.full_like(position, np.nan), np.full_like(angles, np.nan)
     if not messages:
         return network
@@ -153,7 +154,7 @@ def without_placeholders(network: Network) -> Network:
     )
 
 
-def _numbers(values: Float[np.ndarray, " n"]) -> str:
+def _format_numbers(values: Float[np.ndarray, " n"]) -> str:
     return ", ".join(f"{value:g}" for value in values)
 
 
@@ -173,28 +174,28 @@ def find_start_values(
     # Observations of further kinds may give start values, as satellite positions do.
     for rows in network.further:
         network = rows.begin(network)
-    sighted = sights(network, tolerance)
-    model, frame = _orient(network, sighted, improve and partial(improve, network), settings)
+    sights = make_sights(network, tolerance)
+    model, frame = _orient(network, sights, improve and partial(improve, network), settings)
     if not model.placed.any():
-        why = _describe_mirror(network, sighted, settings) or _why_nothing(
-            network, sighted, settings
-        )
+        why = _describe_mirror(network, sights, settings) or _why_nothing(network, sights, settings)
         raise _no_start_values(network, why)
-    oriented = _result(network, sighted, model, frame, settings)
+    oriented = _result(network, sights, model, frame, settings)
     # Control points that most of their rays miss grossly.
-    wrong = np.bincount(sighted.point, _are_gross(sighted, model, settings), sighted.points)
-    rays = _rays_of(sighted, model)
-    missed = are_held(network.points, settings) & (2 * wrong > rays)
-    finding = name_contradiction(network, sighted, model, settings) if missed.any() else ""
-    control_left = (are_controlled(network.points) & ~missed & (rays > 0)).sum()
+    gross_counts = np.bincount(sights.point, _are_gross(sights, model, settings), sights.points)
+    rays = _ray_counts(sights, model)
+    is_missed = are_held(network.points, settings) & (2 * gross_counts > rays)
+    finding = name_contradiction(network, sights, model, settings) if is_missed.any() else ""
+    remaining_control = (are_controlled(network.points) & ~is_missed & (rays > 0)).sum()
     why = ""
-    if _control_contradicts(network, sighted, model, settings):
+    if _control_contradicts(network, sights, model, settings):
         # A datum needs three control points; with as many left the wrong ones are only excluded.
-        why = _describe_mirror(network, sighted, settings) or (finding if control_left < 3 else "")
+        why = _describe_mirror(network, sights, settings) or (
+            finding if remaining_control < 3 else ""
+        )
     if why:
         raise _no_start_values(network, why)
-    if missed.any() and control_left < 3:
-        finding = name_suspects(network, missed)
+    if is_missed.any() and remaining_control < 3:
+        finding = name_suspects(network, is_missed)
     if not finding:
         return oriented
     return dataclasses.replace(oriented, network=oriented.network.warn(finding), finding=finding)
@@ -208,70 +209,70 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
     )
 
 
-def _rays_of(sighted: Sights, model: Model) -> Int[np.ndarray, " points"]:
+def _ray_counts(sights: Sights, model: Model) -> Int[np.ndarray, " points"]:
     """Rays of every point from oriented images."""
-    return np.bincount(sighted.point[model.placed[sighted.image]], minlength=sighted.points)
+    return np.bincount(sights.point[model.placed[sights.image]], minlength=sights.points)
 
 
 def _control_contradicts(
-    network: Network, sighted: Sights, model: Model, settings: StartValueSettings
+    network: Network, sights: Sights, model: Model, settings: StartValueSettings
 ) -> bool:
     """Whether many rays miss their control points grossly, or many points have rays that do not
     intersect."""
     control = are_controlled(network.points)
-    placed = model.placed[sighted.image]
-    rays = control[sighted.point] & placed
-    wrong = _are_gross(sighted, model, settings)
-    seen_twice = _rays_of(sighted, model) > 1
-    unmet = seen_twice & ~model.known
+    placed = model.placed[sights.image]
+    control_rays = control[sights.point] & placed
+    is_gross = _are_gross(sights, model, settings)
+    seen_twice = _ray_counts(sights, model) > 1
+    is_not_intersected = seen_twice & ~model.known
     return bool(control.any()) and bool(
-        wrong[rays].sum() > settings.contradicted_share * rays.sum()
-        or unmet.sum() > settings.contradicted_share * seen_twice.sum()
+        is_gross[control_rays].sum() > settings.contradicted_share * control_rays.sum()
+        or is_not_intersected.sum() > settings.contradicted_share * seen_twice.sum()
     )
 
 
-def _describe_mirror(network: Network, sighted: Sights, settings: StartValueSettings) -> str:
+def _describe_mirror(network: Network, sights: Sights, settings: StartValueSettings) -> str:
     """Whether a model without control fits it only as a mirror image, in words."""
-    model = _grow_from_a_pair(network, sighted, Model.empty(sighted), None, settings)
+    model = _grow_from_a_pair(network, sights, Model.empty(sights), None, settings)
     return "" if model is None else describe_mirror(network, model, settings)
 
 
 def _orient(
-    network: Network, sighted: Sights, improve: Improve | None, settings: StartValueSettings
+    network: Network, sights: Sights, improve: Improve | None, settings: StartValueSettings
 ) -> tuple[Model, str]:
     """The model of steps 1 to 4 (see above), and its frame in words."""
-    model, frame = _start_from_given(network, sighted, settings), "in the frame given"
-    grow(sighted, model, improve=improve, settings=settings)
+    model, frame = _start_from_given(network, sights, settings), "in the frame given"
+    grow(sights, model, improve=improve, settings=settings)
     if not model.placed.any():
         approximate = _with_approximate_points(network, model, settings)
-        grow(sighted, approximate, improve=improve, settings=settings)
+        grow(sights, approximate, improve=improve, settings=settings)
         model = approximate if approximate.placed.any() else model
-    fixed = model.placed.any()
+    is_in_given_frame = model.placed.any()
     while not model.placed.all():
-        part = _grow_from_a_pair(network, sighted, model, improve, settings)
+        part = _grow_from_a_pair(network, sights, model, improve, settings)
         if part is None:
             break
         # A part of its own frame and scale: images that see too few known points for a resection
         # have points in common with one oriented image, or lengths that are known.
         if model.placed.any():
-            part = join(network, sighted, model, part)
+            part = join(network, sights, model, part)
             assert part is not None, "a pair is taken only if it can be joined"
         model = part
-        grow(sighted, model, improve=improve, settings=settings)
+        grow(sights, model, improve=improve, settings=settings)
         # As soon as control is reached, it carries the rest: points that are held do not drift.
-        if not fixed and (in_given_frame := move_to_given_frame(network, sighted, model)):
-            fixed, frame = True, "in the frame given"
-            model = _with_control(network, in_given_frame, settings)
-            grow(sighted, model, improve=improve, settings=settings)
-    finish(sighted, model, settings)
-    model = _place_doubtful_again(network, sighted, model, improve, settings)
-    place_far_points(sighted, model, settings)
-    return (model, frame) if fixed else to_scale(network, model)
+        if not is_in_given_frame and (aligned := move_to_given_frame(network, sights, model)):
+            is_in_given_frame, frame = True, "in the frame given"
+            model = _with_control(network, aligned, settings)
+            grow(sights, model, improve=improve, settings=settings)
+    finish(sights, model, settings)
+    model = _place_doubtful_again(network, sights, model, improve, settings)
+    place_far_points(sights, model, settings)
+    return (model, frame) if is_in_given_frame else to_scale(network, model)
 
 
 def _place_doubtful_again(
     network: Network,
-    sighted: Sights,
+    sights: Sights,
     model: Model,
     improve: Improve | None,
     settings: StartValueSettings,
@@ -283,26 +284,28 @@ def _place_doubtful_again(
     # The points of an image are checked by two others.
     if placed.sum() < 3:
         return model
-    agreeing, share = _count_agreeing(sighted, model)
+    agreeing, share = _count_agreeing(sights, model)
     limit = settings.doubtful_share * np.median(share[placed])
-    doubtful = placed & ~_have_poses(network) & (share < limit)
-    if not doubtful.any() or (placed & ~doubtful).sum() < 2:
+    is_doubtful = placed & ~_have_poses(network) & (share < limit)
+    if not is_doubtful.any() or (placed & ~is_doubtful).sum() < 2:
         return model
-    replaced = model.copy_without(doubtful)
-    grow(sighted, replaced, improve=improve, settings=settings)
-    finish(sighted, replaced, settings)
-    is_lost = placed & ~replaced.placed & ~doubtful
-    return model if is_lost.any() or _count_agreeing(sighted, replaced)[0] <= agreeing else replaced
+    regrown = model.copy_without(is_doubtful)
+    grow(sights, regrown, improve=improve, settings=settings)
+    finish(sights, regrown, settings)
+    lost_images = placed & ~regrown.placed & ~is_doubtful
+    return (
+        model if lost_images.any() or _count_agreeing(sights, regrown)[0] <= agreeing else regrown
+    )
 
 
-def _count_agreeing(sighted: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
+def _count_agreeing(sights: Sights, model: Model) -> tuple[int, Float[np.ndarray, " images"]]:
     """The number of agreeing rays; and their share of those of every placed image that belong to
     known control or to points with two rays."""
-    checked = model.control | (_rays_of(sighted, model) > 1)
-    rays = model.placed[sighted.image] & checked[sighted.point]
-    agree = rays & (misclosures(sighted, model) < sighted.tolerance[sighted.image])
-    number, good = (np.bincount(sighted.image, r, sighted.images) for r in (rays, agree))
-    return int(agree.sum()), good / np.maximum(number, 1)
+    is_checked = model.control | (_ray_counts(sights, model) > 1)
+    rays = model.placed[sights.image] & is_checked[sights.point]
+    agrees = rays & (misclosures(sights, model) < sights.tolerance[sights.image])
+    number, good = (np.bincount(sights.image, r, sights.images) for r in (rays, agrees))
+    return int(agrees.sum()), good / np.maximum(number, 1)
 
 
 def _have_poses(network: Network) -> Bool[np.ndarray, " images"]:
@@ -311,9 +314,9 @@ def _have_poses(network: Network) -> Bool[np.ndarray, " images"]:
     return np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
 
 
-def _start_from_given(network: Network, sighted: Sights, settings: StartValueSettings) -> Model:
+def _start_from_given(network: Network, sights: Sights, settings: StartValueSettings) -> Model:
     """Images with all six start values, points with all three coordinates known."""
-    model, images = Model.empty(sighted), network.images
+    model, images = Model.empty(sights), network.images
     has_pose = _have_poses(network)
     if has_pose.any():
         model.place(has_pose, images.position[has_pose], batched.matrices(images.angles[has_pose]))
@@ -328,123 +331,123 @@ def _with_control(network: Network, model: Model, settings: StartValueSettings) 
 
 def _with_approximate_points(network: Network, model: Model, settings: StartValueSettings) -> Model:
     points = network.points
-    is_given = np.isfinite(points.position).all(1) & ~points.has_role("check")
-    is_given &= are_held(points, settings) | ~are_controlled(points)
-    X = np.where(is_given[:, None], points.position, model.X)
+    has_coordinates = np.isfinite(points.position).all(1) & ~points.has_role("check")
+    has_coordinates &= are_held(points, settings) | ~are_controlled(points)
+    X = np.where(has_coordinates[:, None], points.position, model.X)
     # A copy: `grow` changes it in place, and this attempt may be discarded.
-    return dataclasses.replace(model, X=X, known=model.known | is_given, placed=model.placed.copy())
+    return dataclasses.replace(
+        model, X=X, known=model.known | has_coordinates, placed=model.placed.copy()
+    )
 
 
 def _grow_from_a_pair(
     network: Network,
-    sighted: Sights,
+    sights: Sights,
     model: Model,
     improve: Improve | None,
     settings: StartValueSettings,
 ) -> Model | None:
     """The best of the models grown from a few good pairs of unoriented images; if some are
     oriented, from pairs with one of them, to a model that can be joined to theirs."""
-    new, linked = ~model.placed, bool(model.placed.any())
+    is_unplaced, must_link = ~model.placed, bool(model.placed.any())
     # Placed images that share enough points with unplaced ones.
-    of_new = np.zeros(sighted.points, bool)
-    of_new[sighted.point[new[sighted.image]]] = True
-    shared = np.bincount(sighted.image, of_new[sighted.point], minlength=sighted.images)
-    old = (shared >= settings.min_common_points) & model.placed
-    best, largest_number = None, 0
-    for image, partner, rotation_1, rotation_2, b in good_pairs(
-        sighted, new | old, old, linked, settings
+    of_new = np.zeros(sights.points, bool)
+    of_new[sights.point[is_unplaced[sights.image]]] = True
+    shared = np.bincount(sights.image, of_new[sights.point], minlength=sights.images)
+    is_linking = (shared >= settings.min_common_points) & model.placed
+    best, most_agreeing = None, 0
+    for first_image, second_image, first_M, second_M, b in good_pairs(
+        sights, is_unplaced | is_linking, is_linking, must_link, settings
     ):
-        part = Model.empty(sighted)
-        part.place(image, np.zeros(3), rotation_1)
-        part.place(partner, b, rotation_2)
-        grow(sighted, part, new | old, improve, settings)
-        rows = new[sighted.image]
-        good = int((misclosures(sighted, part) < sighted.tolerance[sighted.image])[rows].sum())
-        if good > largest_number and not (linked and join(network, sighted, model, part) is None):
-            best, largest_number = part, good
-        if largest_number >= settings.sufficient_share * rows.sum():
+        part = Model.empty(sights)
+        part.place(first_image, np.zeros(3), first_M)
+        part.place(second_image, b, second_M)
+        grow(sights, part, is_unplaced | is_linking, improve, settings)
+        rows = is_unplaced[sights.image]
+        good = int((misclosures(sights, part) < sights.tolerance[sights.image])[rows].sum())
+        if good > most_agreeing and not (must_link and join(network, sights, model, part) is None):
+            best, most_agreeing = part, good
+        if most_agreeing >= settings.sufficient_share * rows.sum():
             break
     return best
 
 
 def _result(
-    network: Network, sighted: Sights, model: Model, frame: str, settings: StartValueSettings
+    network: Network, sights: Sights, model: Model, frame: str, settings: StartValueSettings
 ) -> Oriented:
     """The network with the start values of a model, and reasons where there are none."""
     images, points = network.images, network.points
     position, angles = images.position.copy(), images.angles.copy()
-    lacking = model.placed & ~np.isfinite(np.concatenate([position, angles], 1)).all(1)
+    needs_pose = model.placed & ~np.isfinite(np.concatenate([position, angles], 1)).all(1)
     # Images with too few consistent known points.
-    gross = _are_gross(sighted, model, settings)
-    of_image = lambda rows: np.bincount(sighted.image, rows, minlength=sighted.images)
+    is_gross = _are_gross(sights, model, settings)
+    of_image = lambda rows: np.bincount(sights.image, rows, minlength=sights.images)
     wrong_share = 1 - settings.agreeing_share
-    disagrees = of_image(gross) > wrong_share * of_image(model.known[sighted.point])
+    disagrees = of_image(is_gross) > wrong_share * of_image(model.known[sights.point])
     # In the model itself: `find_start_values` counts only the images left.
-    model.placed[lacking & disagrees] = False
-    lacking &= model.placed
-    position[lacking] = model.X0[lacking]
-    if lacking.any():
-        angles[lacking] = batched.angles(model.M[lacking])
+    model.placed[needs_pose & disagrees] = False
+    needs_pose &= model.placed
+    position[needs_pose] = model.X0[needs_pose]
+    if needs_pose.any():
+        angles[needs_pose] = batched.angles(model.M[needs_pose])
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
-    wrong = sighted.row[gross]
+    gross_rows = sights.row[is_gross]
     keep = model.placed
-    is_known = np.all(np.isfinite(X), axis=1)
-    reasons = explain_missing(network, sighted, model, is_known, settings)
+    has_coordinates = np.all(np.isfinite(X), axis=1)
+    reasons = explain_missing(network, sights, model, has_coordinates, settings)
     rays = network.observations
     network = network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),
-        observations=rays.take(np.setdiff1d(np.arange(len(rays)), wrong)),
+        observations=rays.take(np.setdiff1d(np.arange(len(rays)), gross_rows)),
     )
-    network = keep_points(keep_images(network, keep), is_known)
+    network = keep_points(keep_images(network, keep), has_coordinates)
     network = network.note(f"start values found, {frame}")
-    for noun, reasons_of_missing in zip(("image", "point"), reasons):
-        network = note_missing(
-            network, noun, reasons_of_missing, "for which no start values were found"
-        )
-    names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
+    for noun, reason_by_id in zip(("image", "point"), reasons):
+        network = note_missing(network, noun, reason_by_id, "for which no start values were found")
+    names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in gross_rows)
     network = record_left_out(network, "image point", names, CONTRADICTION)
     return Oriented(network, frame, *reasons, names)
 
 
 def _are_gross(
-    sighted: Sights, model: Model, settings: StartValueSettings
+    sights: Sights, model: Model, settings: StartValueSettings
 ) -> Bool[np.ndarray, " sights"]:
     """Which rays of known points in oriented images miss them grossly."""
-    return misclosures(sighted, model) > settings.gross_ratio * sighted.tolerance[sighted.image]
+    return misclosures(sights, model) > settings.gross_ratio * sights.tolerance[sights.image]
 
 
-def _why_nothing(network: Network, sighted: Sights, settings: StartValueSettings) -> str:
+def _why_nothing(network: Network, sights: Sights, settings: StartValueSettings) -> str:
     """What is lacking if no image could be oriented."""
     fewest = settings.min_common_points
-    is_known = are_controlled(network.points)
-    control = np.bincount(sighted.image, is_known[sighted.point], minlength=sighted.images)
+    is_controlled = are_controlled(network.points)
+    control = np.bincount(sights.image, is_controlled[sights.point], minlength=sights.images)
     best = int(control.argmax())
-    begin = (
+    first_clause = (
         f"no image sees {settings.min_points} control points that agree ({int(control[best])} in "
         f"{network.images.id[best]!r} at most), and "
     )
-    image_a, image_b, largest_number = 0, 0, 0
-    pairs, number = all_pairs(sighted, np.ones(sighted.images, bool))
+    first_image, second_image, max_common = 0, 0, 0
+    pairs, number = all_pairs(sights, np.ones(sights.images, bool))
     if len(number):
-        largest_number = int(number.max())
-        image_a, image_b = pairs[number.argmax()]
-    if largest_number < fewest:
+        max_common = int(number.max())
+        first_image, second_image = pairs[number.argmax()]
+    if max_common < fewest:
         pair = (
-            f" ({network.images.id[image_a]!r}, {network.images.id[image_b]!r})"
-            if largest_number
+            f" ({network.images.id[first_image]!r}, {network.images.id[second_image]!r})"
+            if max_common
             else ""
         )
         return (
-            f"{begin}no two images have the {fewest} points in common that a relative "
-            f"orientation needs: {largest_number} at most{pair}; measure more points in the same "
-            "images, or "
-            "give start values"
+            f"{first_clause}no two images have the {fewest} points in common that a relative "
+            f"orientation needs: {max_common} at most{pair}; measure more points in the same "
+            "images, or give start values"
         )
     return (
-        f"{begin}no two images share {fewest} points whose rays meet at an angle ({largest_number} "
+        f"{first_clause}no two images share {fewest} points whose rays meet at an angle "
+        f"({max_common} "
         "points in common at most): take images from different positions, look for wrong point "
         "numbers, or give start values"
     )

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.rays import Sights, sights
+from jaxbundle.orientation.rays import Sights, make_sights
 
 # Misclosures up to this number of σ are explained by the measurements. Medians of points are
 # compared with it, which are 0.83 for good σ (Rayleigh distribution): σ of image points may be
@@ -25,13 +25,13 @@ MAX_SIGMA_RATIO = 3.0
 def name_one_place(network: Network) -> str:
     """Which images were taken from one place, in words; empty if they were not, or if there are
     images from other places."""
-    sighted = sights(network)
-    number = np.bincount(sighted.image, minlength=sighted.images)
+    sights = make_sights(network)
+    number = np.bincount(sights.image, minlength=sights.images)
     base = int(number.argmax())
     # Two hundred images that differ from the first by a rotation only are from one place, however
     # many follow; the message then names all images.
     other_images = [image for image in np.flatnonzero(number).tolist() if image != base][:200]
-    if not other_images or not all(_is_rotation(sighted, base, image) for image in other_images):
+    if not other_images or not all(_is_rotation(sights, base, image) for image in other_images):
         return ""
     names = [network.images.id[image] for image in sorted([base, *other_images])]
     return (
@@ -41,22 +41,22 @@ def name_one_place(network: Network) -> str:
     )
 
 
-def _is_rotation(sighted: Sights, image_a: int, image_b: int) -> bool:
+def _is_rotation(sights: Sights, first_image: int, second_image: int) -> bool:
     """Whether a rotation maps the rays of an image to those of another."""
-    a, b = sighted.rows_of(image_a), sighted.rows_of(image_b)
-    _, k, l = np.intersect1d(sighted.point[a], sighted.point[b], return_indices=True)
+    a, b = sights.rows_of(first_image), sights.rows_of(second_image)
+    _, k, l = np.intersect1d(sights.point[a], sights.point[b], return_indices=True)
     if len(k) < 5:  # a rotation has 3 parameters, five points 10 coordinates
         return False
-    noise = np.sqrt(2 * (sighted.sigma[a][k] ** 2 + sighted.sigma[b][l] ** 2))
-    rays = [sighted.ray[a][k], sighted.ray[b][l]]
-    if min(map(_field, rays)) ** 3 < MAX_SIGMA_RATIO * np.median(noise):
+    noise = np.sqrt(2 * (sights.sigma[a][k] ** 2 + sights.sigma[b][l] ** 2))
+    rays = [sights.ray[a][k], sights.ray[b][l]]
+    if min(map(_field_angle, rays)) ** 3 < MAX_SIGMA_RATIO * np.median(noise):
         return False
     U, _, V = np.linalg.svd(rays[0].T @ rays[1])
     turn = U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V
-    difference = np.linalg.norm(rays[0] @ turn - rays[1], axis=1)
-    return bool(np.median(difference / noise) < MAX_SIGMA_RATIO)
+    distances = np.linalg.norm(rays[0] @ turn - rays[1], axis=1)
+    return bool(np.median(distances / noise) < MAX_SIGMA_RATIO)
 
 
-def _field(rays: Float[np.ndarray, "n 3"]) -> float:
+def _field_angle(rays: Float[np.ndarray, "n 3"]) -> float:
     """The angle about the centre of the rays, radians: half of them are within it."""
     return float(np.median(np.linalg.norm(rays - np.median(rays, axis=0), axis=1)))

@@ -59,15 +59,15 @@ def planar_orientations(
     G = G * jnp.where(jnp.sum(p * jnp.einsum("ni,ij,nj->n", a2, G, a1)) < 0, -1.0, 1.0)
     square, V = jnp.linalg.eigh(G.T @ G)
     v3, v2, v1 = V.T
-    long, short = jnp.maximum(square[2] - 1, 0), jnp.maximum(1 - square[0], 0)
+    excess, deficit = jnp.maximum(square[2] - 1, 0), jnp.maximum(1 - square[0], 0)
     # λ₁ − λ₃ is about 2·|b|/d, the base by the distance of the plane: a base of 1e-9 of the
     # distance moves no image point by what can be measured, and is far above rounding (1e-15).
-    no_base = long + short < 1e-9
-    norm = jnp.sqrt(jnp.where(no_base, 1.0, long + short))
+    no_base = excess + deficit < 1e-9
+    base_norm = jnp.sqrt(jnp.where(no_base, 1.0, excess + deficit))
 
     def solution(sign: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
         """M, b, n, and whether the plane is in front of both cameras."""
-        u = (jnp.sqrt(short) * v1 + sign * jnp.sqrt(long) * v3) / norm
+        u = (jnp.sqrt(deficit) * v1 + sign * jnp.sqrt(excess) * v3) / base_norm
         n = jnp.cross(v2, u)
         Gv, Gu = G @ v2, G @ u
         M = jnp.stack([Gv, Gu, jnp.cross(Gv, Gu)], 1) @ jnp.stack([v2, u, n])
@@ -75,9 +75,9 @@ def planar_orientations(
         b = -M.T @ (G - M) @ n
         length = jnp.linalg.norm(b)
         # Depth of the points in both cameras, in units of the plane's distance.
-        depth_1 = 1 / (a1 @ n)
-        point_2 = (depth_1[:, None] * a1 - b) @ M.T
-        front = (depth_1 > 0) & (point_2[:, 2] < 0)
+        depth = 1 / (a1 @ n)
+        in_second = (depth[:, None] * a1 - b) @ M.T
+        front = (depth > 0) & (in_second[:, 2] < 0)
         return M, b / jnp.where(length > 0, length, 1.0), n, jnp.all(front | (p == 0))
 
     M, b, n, possible = jax.vmap(solution)(jnp.array([1.0, -1.0]))

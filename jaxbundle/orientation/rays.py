@@ -61,7 +61,7 @@ class Sights:
         return slice(begin, end)
 
 
-def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
+def make_sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
     """The image points of a network with the interior orientation it gives.
 
     **Arguments:** `tolerance`: of start values, relative to the extent of an image (`Sights`)."""
@@ -77,10 +77,10 @@ def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
         for interfaces in network.further:
             if isinstance(interfaces, Interfaces):
                 d[rows] = interfaces.directions(camera.id, d[rows])
-        off_axis = np.arctan2(np.hypot(d[rows, 0], d[rows, 1]), -d[rows, 2])
+        axis_angle = np.arctan2(np.hypot(d[rows, 0], d[rows, 1]), -d[rows, 2])
         # The 95 % quantile: a few image points far outside are blunders, not the extent.
-        if np.isfinite(off_axis).any():
-            extent[images.camera == c] = np.nanquantile(off_axis, 0.95)
+        if np.isfinite(axis_angle).any():
+            extent[images.camera == c] = np.nanquantile(axis_angle, 0.95)
     rows = np.flatnonzero(np.isfinite(d).all(1))
     rows = rows[np.argsort(rays.image[rows], kind="stable")]
     return Sights(
@@ -107,8 +107,8 @@ def rays_of(
     batch = 4096
     batches = -(-len(xy) // batch)
     fill = lambda a: np.resize(a, (batches * batch, 2)).reshape(batches, batch, 2)
-    rays_by_batch = [_rays_of_batch(model, p, *parts) for parts in zip(fill(xy), fill(sigma))]
-    d, noise = (np.concatenate([np.asarray(part[k]) for part in rays_by_batch]) for k in (0, 1))
+    computed = [_rays_of_batch(model, p, *parts) for parts in zip(fill(xy), fill(sigma))]
+    d, noise = (np.concatenate([np.asarray(part[k]) for part in computed]) for k in (0, 1))
     return d[: len(xy)], noise[: len(xy)]
 
 
@@ -129,9 +129,9 @@ def in_plane(
         return np.eye(3), _in_plane(rays)
     axis = -rays.mean(0)
     # The rotation that takes the axis to z; about x or y, whichever is farther from it.
-    helper_axis = np.eye(3)[np.argmin(np.abs(axis[:2]))]
+    start_axis = np.eye(3)[np.argmin(np.abs(axis[:2]))]
     z = axis / np.linalg.norm(axis)
-    x = helper_axis - (helper_axis @ z) * z
+    x = start_axis - (start_axis @ z) * z
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z])
     return R, _in_plane(rays @ R.T)
@@ -158,7 +158,7 @@ def _rays_of_batch(
     ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         d = ray(*xy)
         # σ is small beside the image: the rays one σ away are as good as a derivative.
-        shifted = jnp.stack([ray(xy[0] + sigma[0], xy[1]), ray(xy[0], xy[1] + sigma[1])])
-        return d, jnp.sqrt(jnp.sum((shifted - d) ** 2) / 2)
+        displaced = jnp.stack([ray(xy[0] + sigma[0], xy[1]), ray(xy[0], xy[1] + sigma[1])])
+        return d, jnp.sqrt(jnp.sum((displaced - d) ** 2) / 2)
 
     return jax.vmap(ray_and_sigma)(xy, sigma)

@@ -92,8 +92,8 @@ def relative_orientation(
         E = jnp.concatenate([E, five_solutions(*points)[0]])
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))
-    best_candidate, score = _refine_best(M, b, stop_gradient(data), p)
-    fit = finish(coplanarity_misclosures, retract, best_candidate, data, 5)
+    best, score = _refine_best(M, b, stop_gradient(data), p)
+    fit = finish(coplanarity_misclosures, retract, best, data, 5)
     M, b = fit.estimate
     front = _in_front((M, b), xy1, xy2, p)
     vtpv = stop_gradient(fit.vtpv)
@@ -131,10 +131,10 @@ def distances_along_rays(
     """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
     a1, a2 = _rays(xy1, xy2)
     a2, base = rotate_back(rows_of_matrix(M), a2), unpack(b)
-    aa, cc, a_c = dot(a1, a1), dot(a2, a2), dot(a1, a2)
-    b_a, b_c = dot(base, a1), dot(base, a2)
-    determinant = aa * cc - a_c * a_c
-    s = jnp.stack([cc * b_a - a_c * b_c, a_c * b_a - aa * b_c])
+    aa, cc, ac = dot(a1, a1), dot(a2, a2), dot(a1, a2)
+    ab, cb = dot(base, a1), dot(base, a2)
+    determinant = aa * cc - ac * ac
+    s = jnp.stack([cc * ab - ac * cb, ac * ab - aa * cb])
     return s / jnp.where(determinant > 0, determinant, 1)
 
 
@@ -163,11 +163,11 @@ def _refine_best(
         value = (square / jnp.sum(p) + ROUNDING_VARIANCE) * (1 + 100 * behind)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
-    first_score = lambda M, b: score((M, b), jnp.sum(coplanarity_misclosures((M, b), *data) ** 2))
+    initial_score = lambda M, b: score((M, b), jnp.sum(coplanarity_misclosures((M, b), *data) ** 2))
     # Of up to 44 candidates. Of 400 pairs of images with eight points and noise of 1e-3, 3 % ended
     # above the best vᵀPv by more than 1 % with two, 2 % with four, 0.7 % with eight, which cost
     # twice the time; of a nearly flat object 6, 1.5 and 0.5 %.
-    _, best = jax.lax.top_k(-jax.vmap(first_score)(M, b), 4)
+    _, best = jax.lax.top_k(-jax.vmap(initial_score)(M, b), 4)
     refine = lambda M, b: minimise(coplanarity_misclosures, retract, (M, b), data, 5)
     refined, squares = jax.vmap(refine)(M[best], b[best])
     scores = jax.vmap(score)(refined, squares)
@@ -175,11 +175,11 @@ def _refine_best(
     return jax.tree.map(lambda a: a[k], refined), scores[k]
 
 
-def _wait_for(waited_for: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
-    """The arrays, which wait for `waited_for`: adds zero. Decompositions that run side by side can
-    hang jaxlib 0.10 on two cores; a barrier does not order them."""
-    nothing = jnp.where(jnp.sum(waited_for) > 1e300, 1.0, 0.0)
-    return jax.tree.map(lambda a: a + nothing, arrays)
+def _wait_for(result: Float[AnyArray, "..."], arrays: PyTree) -> PyTree:
+    """The arrays, which wait for `result`: adds zero. Decompositions that run side by side can hang
+    jaxlib 0.10 on two cores; a barrier does not order them."""
+    zero = jnp.where(jnp.sum(result) > 1e300, 1.0, 0.0)
+    return jax.tree.map(lambda a: a + zero, arrays)
 
 
 def coplanarity_misclosures(
@@ -204,9 +204,9 @@ def retract(pair: Motion, delta: Float[AnyArray, "5"]) -> Motion:
 def _perpendiculars(b: Float[AnyArray, "3"]) -> Float[Array, "2 3"]:
     """Two unit vectors perpendicular to b, of length 1, and to one another."""
     axis = jnp.eye(3, dtype=b.dtype)[jnp.argmin(jnp.abs(stop_gradient(b)))]
-    axis_1 = jnp.cross(b, axis)
-    axis_1 = axis_1 / jnp.linalg.norm(axis_1)
-    return jnp.stack([axis_1, jnp.cross(b, axis_1)])
+    normal = jnp.cross(b, axis)
+    normal = normal / jnp.linalg.norm(normal)
+    return jnp.stack([normal, jnp.cross(b, normal)])
 
 
 def _in_front(
@@ -244,5 +244,5 @@ def _find_simpler(
         return jnp.where(redundancy > 0, variance, jnp.inf)
 
     rotation, plane = variance_of(by_rotation, 3), variance_of(by_plane, 8)
-    limit = lambda other: MAX_VARIANCE_RATIO * other + ROUNDING_VARIANCE * average
+    limit = lambda reference: MAX_VARIANCE_RATIO * reference + ROUNDING_VARIANCE * average
     return rotation < limit(jnp.minimum(variance, plane)), plane < limit(variance)

@@ -50,15 +50,15 @@ def resection(
     more), `BEHIND_THE_CAMERA`. The cofactors of a centre near it show this.
     """
     p = ones_unless(weights, xy)
-    three_rows = wide_triangle(xy, p)
+    triangle = wide_triangle(xy, p)
     # With noise, the pose nearest to a solution may be all there is, and a good start.
     starts, _ = three_points(
-        jax.vmap(ray_of)(stop_gradient(xy[three_rows])), stop_gradient(X[three_rows])
+        jax.vmap(ray_of)(stop_gradient(xy[triangle])), stop_gradient(X[triangle])
     )
     data = (xy, X, jnp.sqrt(p))
     refine = lambda start: minimise(_misclosures, retract_pose, start, data, 6)
     poses, squares = jax.vmap(refine)(starts)
-    behind = jax.vmap(lambda pose: jnp.sum(jnp.where(p > 0, _behind(pose, X), 0)))(poses)
+    behind = jax.vmap(lambda pose: jnp.sum(jnp.where(p > 0, _is_behind(pose, X), 0)))(poses)
     worst = jnp.where(jnp.isfinite(squares), behind, jnp.inf)
     # First the fewest points behind the camera, then the least vᵀPv: a pose on the other side of a
     # flat object fits the images as well.
@@ -88,7 +88,7 @@ def refine_resection(
     status = first_of(
         (are_collinear(X, p), Status.COLLINEAR_POINTS),
         (~fit.determined, Status.DANGER_CYLINDER),
-        (jnp.any(_behind(fit.estimate, X) & (p > 0)), Status.BEHIND_THE_CAMERA),
+        (jnp.any(_is_behind(fit.estimate, X) & (p > 0)), Status.BEHIND_THE_CAMERA),
     )
     return Resection(fit.estimate, fit.vtpv, fit.cofactor, status)
 
@@ -96,12 +96,12 @@ def refine_resection(
 def wide_triangle(xy: Float[AnyArray, "n 2"], weights: Float[AnyArray, " n"]) -> Int[Array, "3"]:
     """Three of the points of weight > 0, far apart: outermost, farthest from it, largest area."""
     xy = stop_gradient(xy)
-    row_of_largest = lambda value: jnp.argmax(jnp.where(weights > 0, value, -1.0))
+    argmax_of = lambda value: jnp.argmax(jnp.where(weights > 0, value, -1.0))
     distance = lambda point: jnp.sum((xy - point) ** 2, 1)
-    i = row_of_largest(distance(normalisation(xy, weights)[0]))
-    j = row_of_largest(distance(xy[i]))
-    side, from_corner = xy[j] - xy[i], xy - xy[i]
-    k = row_of_largest(jnp.abs(side[0] * from_corner[:, 1] - side[1] * from_corner[:, 0]))
+    i = argmax_of(distance(normalisation(xy, weights)[0]))
+    j = argmax_of(distance(xy[i]))
+    side, offsets = xy[j] - xy[i], xy - xy[i]
+    k = argmax_of(jnp.abs(side[0] * offsets[:, 1] - side[1] * offsets[:, 0]))
     return jnp.stack([i, j, k])
 
 
@@ -115,5 +115,5 @@ def _misclosures(
     return (sqrt_weight[:, None] * (computed - xy)).ravel()
 
 
-def _behind(pose: CameraPose, X: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
+def _is_behind(pose: CameraPose, X: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
     return jax.vmap(to_camera, (None, 0))(pose, X)[:, 2] >= 0

@@ -95,7 +95,7 @@ def consensus(
     models = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), models)
 
     def score(model: PyTree, valid: Bool[Array, ""]) -> Float[Array, ""]:
-        e = _finite(errors(model, *data))
+        e = _bound_errors(errors(model, *data))
         if threshold is None:
             value = _median(e, present)
         else:
@@ -104,7 +104,7 @@ def consensus(
 
     best = jnp.argmin(jax.vmap(score)(models, valid.reshape(-1)))
     model = jax.tree.map(lambda a: a[best], models)
-    e = _finite(errors(model, *data))
+    e = _bound_errors(errors(model, *data))
     limit = robust_limit(e, present, size) if threshold is None else jnp.asarray(threshold)
     return Consensus(model, present & (e <= limit), limit)
 
@@ -144,14 +144,14 @@ def robust_resection(
         return jnp.where(q < 0, e, IMPOSSIBLE_ERROR)
 
     solve = lambda xy, X: three_points(jax.vmap(ray_of)(xy), X)
-    consensus_model = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
-    pose, good = consensus_model.model, consensus_model.inliers
+    sample_fit = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
+    pose, good = sample_fit.model, sample_fit.inliers
 
     def adjust(pose: CameraPose, good: Bool[AnyArray, " n"]) -> tuple[Resection, Bool[Array, " n"]]:
-        consensus_model = refine_resection(pose, xy, X, p * good)
-        return consensus_model, _are_good(errors(consensus_model.pose, xy, X), p > 0, 3, threshold)
+        resected = refine_resection(pose, xy, X, p * good)
+        return resected, _are_good(errors(resected.pose, xy, X), p > 0, 3, threshold)
 
-    return _repeat(adjust, good, pose, lambda consensus_model: consensus_model.pose)
+    return _repeat(adjust, good, pose, lambda resected: resected.pose)
 
 
 def robust_relative_orientation(
@@ -193,7 +193,7 @@ def robust_relative_orientation(
         E, valid = five_solutions(xy1, xy2)
         return jax.vmap(in_front)(E), valid
 
-    consensus_model = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
+    sample_fit = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
 
     def adjust(
         _: None, good: Bool[AnyArray, " n"]
@@ -201,7 +201,7 @@ def robust_relative_orientation(
         result = relative_orientation(xy1, xy2, p * good)
         return result, _are_good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
 
-    return _repeat(adjust, consensus_model.inliers)
+    return _repeat(adjust, sample_fit.inliers)
 
 
 def robust_homography(
@@ -218,11 +218,11 @@ def robust_homography(
     """
 
     def errors(
-        matrices: tuple[Array, Array],
+        solution: tuple[Array, Array],
         source: Float[AnyArray, "n 2"],
         target: Float[AnyArray, "n 2"],
     ) -> Float[Array, " n"]:
-        image = jax.vmap(apply_homography, (None, 0))(matrices[0], source)
+        image = jax.vmap(apply_homography, (None, 0))(solution[0], source)
         return jnp.linalg.norm(image - target, axis=1)
 
     data = (source, target)
@@ -243,11 +243,11 @@ def robust_absolute_orientation(
     """
 
     def errors(
-        absolute: AbsoluteOrientation,
+        solution: AbsoluteOrientation,
         source: Float[AnyArray, "n 3"],
         target: Float[AnyArray, "n 3"],
     ) -> Float[Array, " n"]:
-        transformed = jax.vmap(transform_point, (None, 0))(absolute.tau, source)
+        transformed = jax.vmap(transform_point, (None, 0))(solution.tau, source)
         return jnp.linalg.norm(transformed - target, axis=1)
 
     data = (source, target)
@@ -292,12 +292,12 @@ def robust_intersection(
     """
 
     def errors(
-        intersected: Intersection, X0: Float[AnyArray, "n 3"], rays: Float[AnyArray, "n 3"]
+        solution: Intersection, X0: Float[AnyArray, "n 3"], rays: Float[AnyArray, "n 3"]
     ) -> Float[Array, " n"]:
-        d = intersected.X - X0
-        depth = jnp.sum(d * rays, 1)
-        angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), depth)
-        return jnp.where(depth > 0, angle, IMPOSSIBLE_ERROR)
+        d = solution.X - X0
+        distance = jnp.sum(d * rays, 1)
+        angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), distance)
+        return jnp.where(distance > 0, angle, IMPOSSIBLE_ERROR)
 
     return _robust_weighted(key, intersection, errors, (X0, rays), weights, 2, samples, threshold)
 
@@ -346,24 +346,24 @@ def _repeat(
         state: tuple[PyTree, Bool[AnyArray, " n"]], _: None
     ) -> tuple[tuple[PyTree, Bool[Array, " n"]], tuple[Any, Bool[AnyArray, " n"]]]:
         model, good = state
-        models_and_good, better = adjust(model, good)
-        return (model_of(models_and_good), better), (models_and_good, good)
+        solution, better = adjust(model, good)
+        return (model_of(solution), better), (solution, good)
 
     # Of 100 resections of 30 points with 35 % of gross errors, without a round 1 % of the good
     # points were missed; one, three and six gave the same points. Three are for the few that move
     # on.
-    _, models_and_good = jax.lax.scan(choose_again, (model, good), length=3 + 1)
-    return jax.tree.map(lambda rounds: rounds[-1], models_and_good)
+    _, history = jax.lax.scan(choose_again, (model, good), length=3 + 1)
+    return jax.tree.map(lambda rounds: rounds[-1], history)
 
 
 def _are_good(
     e: Float[Array, " n"], present: Bool[Array, " n"], size: int, threshold: Scalar | None
 ) -> Bool[Array, " n"]:
-    e = _finite(e)
+    e = _bound_errors(e)
     return present & (e <= (robust_limit(e, present, size) if threshold is None else threshold))
 
 
-def _finite(e: Float[Array, " n"]) -> Float[Array, " n"]:
+def _bound_errors(e: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.where(jnp.isfinite(e), e, IMPOSSIBLE_ERROR)
 
 

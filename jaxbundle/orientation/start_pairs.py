@@ -16,10 +16,10 @@ from jaxbundle.types import Index
 
 
 def good_pairs(
-    sighted: Sights,
+    sights: Sights,
     candidates: Bool[np.ndarray, " images"],
-    old: Bool[np.ndarray, " images"],
-    linked: bool,
+    is_linking: Bool[np.ndarray, " images"],
+    must_link: bool,
     settings: StartValueSettings,
 ) -> Iterator[
     tuple[
@@ -30,12 +30,12 @@ def good_pairs(
         Float[np.ndarray, "3"],
     ]
 ]:
-    """Pairs, the rotations of both and the base between them, the most promising first; `linked`:
-    of an old image and another."""
-    pairs, common = _pairs_in_common(sighted, candidates, old, linked, settings)
+    """Pairs, the rotations of both and the base between them, the most promising first;
+    `must_link`: of an image with `is_linking` and another."""
+    pairs, common = _pairs_in_common(sights, candidates, is_linking, must_link, settings)
     if not len(pairs):
         return
-    common_points = [_common_points(sighted, *pair) for pair in pairs]
+    common_points = [_common_points(sights, *pair) for pair in pairs]
     has_enough = [len(xy) >= settings.min_common_points for *_, xy, _ in common_points]
     common_points, pairs, common = (
         list(itertools.compress(common_points, has_enough)),
@@ -45,7 +45,7 @@ def good_pairs(
     if not common_points:
         return
     R, Q, xy, other_xy = zip(*common_points)
-    tolerance = sighted.tolerance[pairs].mean(1)
+    tolerance = sights.tolerance[pairs].mean(1)
     M, b, share, angle = batched.orient_pairs(xy, other_xy, tolerance)
     # 1/σ of the depth of a pair: with the root of the number of points and with the angle. Beyond
     # `good_angle` images differ so much that many points are seen in one only.
@@ -56,46 +56,46 @@ def good_pairs(
 
 
 def _pairs_in_common(
-    sighted: Sights,
+    sights: Sights,
     candidates: Bool[np.ndarray, " images"],
-    old: Bool[np.ndarray, " images"],
-    linked: bool,
+    is_linking: Bool[np.ndarray, " images"],
+    must_link: bool,
     settings: StartValueSettings,
 ) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
     """Up to `max_pairs` pairs of images, and the number of their points: those with the most, and
     others with enough points and wider bases."""
-    pairs, number = all_pairs(sighted, candidates)
-    use = (number >= settings.min_common_points) & (
-        (old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked)
+    pairs, number = all_pairs(sights, candidates)
+    is_usable = (number >= settings.min_common_points) & (
+        (is_linking[pairs[:, 0]] != is_linking[pairs[:, 1]]) | (not must_link)
     )
-    pairs, number = pairs[use], number[use]
+    pairs, number = pairs[is_usable], number[is_usable]
     order = np.argsort(-number, kind="stable")
     # The pairs with the most points often have the shortest bases. So half of the pairs are spread
     # over all that have 0.3 of the most points: with 60 % overlap along a strip, the next image but
     # one still has 0.33 of the points of the next (20 % of the format beside 60 %).
-    sufficient = order[number[order] >= 0.3 * number.max(initial=0)]
+    sufficient_pairs = order[number[order] >= 0.3 * number.max(initial=0)]
     half_number = settings.max_pairs // 2
-    spread_rows = batched.evenly_spaced(len(sufficient), settings.max_pairs - half_number)
-    chosen_pairs = np.unique(np.concatenate([order[:half_number], sufficient[spread_rows]]))
-    return pairs[chosen_pairs], number[chosen_pairs]
+    sample = batched.evenly_spaced(len(sufficient_pairs), settings.max_pairs - half_number)
+    selected = np.unique(np.concatenate([order[:half_number], sufficient_pairs[sample]]))
+    return pairs[selected], number[selected]
 
 
 def all_pairs(
-    sighted: Sights, candidates: Bool[np.ndarray, " images"]
+    sights: Sights, candidates: Bool[np.ndarray, " images"]
 ) -> tuple[Int[np.ndarray, "pairs 2"], Int[np.ndarray, " pairs"]]:
     """Pairs of these images that share points [pairs, 2], and how many."""
     from scipy.sparse import coo_array, triu
 
-    rows = candidates[sighted.image]
-    shape = (sighted.images, sighted.points)
-    sees = coo_array((np.ones(rows.sum(), int), (sighted.image[rows], sighted.point[rows])), shape)
+    rows = candidates[sights.image]
+    shape = (sights.images, sights.points)
+    sees = coo_array((np.ones(rows.sum(), int), (sights.image[rows], sights.point[rows])), shape)
     sees = sees.tocsr()
     common = triu(sees @ sees.T, k=1)
     return np.stack([common.row, common.col], 1), common.data
 
 
 def _common_points(
-    sighted: Sights, image: Index, partner: Index
+    sights: Sights, image: Index, other_image: Index
 ) -> tuple[
     Float[np.ndarray, "3 3"],
     Float[np.ndarray, "3 3"],
@@ -103,8 +103,13 @@ def _common_points(
     Float[np.ndarray, "common 2"],
 ]:
     """The common points of two images: of each the rotation and the coordinates of `in_plane`."""
-    rows_1, rows_2 = sighted.rows_of(image), sighted.rows_of(partner)
-    _, k, l = np.intersect1d(sighted.point[rows_1], sighted.point[rows_2], return_indices=True)
-    (R, xy), (Q, other_xy) = in_plane(sighted.ray[rows_1][k]), in_plane(sighted.ray[rows_2][l])
+    first_rows, second_rows = sights.rows_of(image), sights.rows_of(other_image)
+    _, k, l = np.intersect1d(
+        sights.point[first_rows], sights.point[second_rows], return_indices=True
+    )
+    (R, xy), (Q, other_xy) = (
+        in_plane(sights.ray[first_rows][k]),
+        in_plane(sights.ray[second_rows][l]),
+    )
     is_finite = np.isfinite(xy).all(1) & np.isfinite(other_xy).all(1)
     return R, Q, xy[is_finite], other_xy[is_finite]

@@ -17,7 +17,7 @@ from jaxbundle.network.tables import Network
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.control_consistency import MIN_AGREEING
 from jaxbundle.orientation.incremental import START_VALUE_LIMITS, Model, are_controlled, intersect
-from jaxbundle.orientation.rays import Sights, sights
+from jaxbundle.orientation.rays import Sights, make_sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
 CONTRADICTORY_CONTROL = "control points contradict each other"
@@ -28,7 +28,7 @@ MAX_POINTS_FOR_TRIALS = 12
 
 def name_contradiction(
     network: Network,
-    sighted: Sights | None = None,
+    sights: Sights | None = None,
     model: Model | None = None,
     settings: StartValueSettings = DEFAULTS,
 ) -> str:
@@ -36,41 +36,41 @@ def name_contradiction(
     none do, or if no swap and no single point explains it.
 
     `model`: images oriented in any frame; default: those of the start values."""
-    sighted = sights(network) if sighted is None else sighted
+    sights = make_sights(network) if sights is None else sights
     points = network.points
     # The points determined by the images alone.
-    images_alone = Model.empty(sighted)
+    free_model = Model.empty(sights)
     if model is not None:
-        images_alone.place(model.placed, model.X0[model.placed], model.M[model.placed])
+        free_model.place(model.placed, model.X0[model.placed], model.M[model.placed])
     else:
         images = network.images
         has_pose = np.all(np.isfinite(np.concatenate([images.position, images.angles], 1)), axis=1)
         if has_pose.any():
-            images_alone.place(
+            free_model.place(
                 has_pose, images.position[has_pose], batched.matrices(images.angles[has_pose])
             )
-    intersect(sighted, images_alone, START_VALUE_LIMITS)
-    control = np.flatnonzero(are_controlled(points) & images_alone.known)
-    contradiction_found = contradiction(
-        images_alone.X[control], points.position[control], points.sigma[control], settings
+    intersect(sights, free_model, START_VALUE_LIMITS)
+    control = np.flatnonzero(are_controlled(points) & free_model.known)
+    explanation = contradiction(
+        free_model.X[control], points.position[control], points.sigma[control], settings
     )
-    if contradiction_found is None:
+    if explanation is None:
         return ""
     ids, unit = [points.id[p] for p in control], network.object_unit
-    causes = [f"{ids[i]!r} and {ids[j]!r} are exchanged" for i, j in contradiction_found.exchanges]
-    causes += [
-        f"the coordinates or the number of {ids[k]!r} are wrong" for k in contradiction_found.wrong
-    ]
+    causes = [f"{ids[i]!r} and {ids[j]!r} are exchanged" for i, j in explanation.exchanges]
+    causes += [f"the coordinates or the number of {ids[k]!r} are wrong" for k in explanation.wrong]
     shown_causes = [*causes[:5], *(["…"] if len(causes) > 5 else [])]
-    begin = f"the {len(ids)} {CONTRADICTORY_CONTROL} by {contradiction_found.before:.2g} {unit}"
-    if contradiction_found.together or len(causes) == 1:
+    first_clause = (
+        f"the {len(ids)} {CONTRADICTORY_CONTROL} by {explanation.misfit_before:.2g} {unit}"
+    )
+    if explanation.all_at_once or len(causes) == 1:
         return (
-            f"{begin}, and fit to {contradiction_found.after:.2g} {unit} if "
+            f"{first_clause}, and fit to {explanation.misfit_after:.2g} {unit} if "
             f"{' and '.join(shown_causes)}: correct the "
             "control points, or the numbers in the image points"
         )
     return (
-        f"{begin}, and fit to {contradiction_found.after:.2g} {unit} if "
+        f"{first_clause}, and fit to {explanation.misfit_after:.2g} {unit} if "
         f"{', or if '.join(shown_causes)}; with so few "
         "points more than one explanation is possible: look at the images"
     )
@@ -88,14 +88,14 @@ def name_suspects(network: Network, suspects: Bool[np.ndarray, " points"]) -> st
 
 @dataclasses.dataclass(frozen=True)
 class Contradiction:
-    """The misclosure of points `before`, and `after` two are swapped (`exchanges`) or one is
-    removed (`wrong`): all of these `together`, or each as one of several explanations."""
+    """The misfit of points before and after two are swapped (`exchanges`) or one is removed
+    (`wrong`): all of these at once (`all_at_once`), or each as one of several explanations."""
 
-    before: float
-    after: float
+    misfit_before: float
+    misfit_after: float
     exchanges: Sequence[tuple[int, int]]
     wrong: Sequence[int]
-    together: bool
+    all_at_once: bool
 
 
 def contradiction(
@@ -117,13 +117,13 @@ def contradiction(
     # 99.9 % quantile of χ² with three degrees of freedom is 4.03).
     extent = np.ptp(target, axis=0).max()
     tolerance = float(np.hypot(extent / settings.extent_to_misfit, 4 * largest))
-    misfit = _misfits(source, target, np.ones(n, bool))
-    if misfit is None or misfit.max() < tolerance:
+    misfits = _misfits(source, target, np.ones(n, bool))
+    if misfits is None or misfits.max() < tolerance:
         return None
     good = _agreeing(source, target, tolerance)
     if good.sum() >= max(MIN_AGREEING, n / 2):
-        return _by_majority(source, target, good, tolerance, misfit.max())
-    return _by_trial(source, target, tolerance, misfit.max())
+        return _by_majority(source, target, good, tolerance, misfits.max())
+    return _by_trial(source, target, tolerance, misfits.max())
 
 
 def _by_majority(
@@ -131,7 +131,7 @@ def _by_majority(
     target: Float[np.ndarray, "n 3"],
     good: Bool[np.ndarray, " n"],
     tolerance: float,
-    largest_misfit: float,
+    misfit_before: float,
 ) -> Contradiction | None:
     """Two of the points outside the largest consistent group are exchanged if both fit when
     swapped; the others are wrong."""
@@ -150,14 +150,14 @@ def _by_majority(
             exchanges.append((i, j))
             suspects -= {i, j}
             misfits.append(miss)
-    return Contradiction(largest_misfit, max(misfits), exchanges, sorted(suspects), together=True)
+    return Contradiction(misfit_before, max(misfits), exchanges, sorted(suspects), all_at_once=True)
 
 
 def _by_trial(
     source: Float[np.ndarray, "n 3"],
     target: Float[np.ndarray, "n 3"],
     tolerance: float,
-    largest_misfit: float,
+    misfit_before: float,
 ) -> Contradiction | None:
     """Every swap of two, and every point left out: those after which all points fit."""
     n = len(source)
@@ -165,23 +165,23 @@ def _by_trial(
         return None
     trials = [(pair, ()) for pair in itertools.combinations(range(n), 2)]
     trials += [((), (k,)) for k in range(n) if n >= MIN_AGREEING]
-    solutions = []
+    explanations = []
     for pair, left_out in trials:
         order = np.arange(n)
         order[list(pair)] = pair[::-1]
-        use = ~np.isin(np.arange(n), left_out)
-        misfit = _misfits(source, target[order], use)
-        if misfit is not None and misfit[use].max() < tolerance:
-            solutions.append((misfit[use].max(), pair, left_out))
-    if not solutions:
+        is_used = ~np.isin(np.arange(n), left_out)
+        misfits = _misfits(source, target[order], is_used)
+        if misfits is not None and misfits[is_used].max() < tolerance:
+            explanations.append((misfits[is_used].max(), pair, left_out))
+    if not explanations:
         return None
     # Of few points several explanations fit. Their misfits are of a few redundant coordinates each,
     # whose chance differs by a factor of three easily; what fits worse than that is no equal.
-    best = min(solutions)[0]
-    solutions = [entry for entry in sorted(solutions) if entry[0] <= 3 * best]
-    exchanges = [pair for _, pair, _ in solutions if pair]
-    wrong = [k for *_, left_out in solutions for k in left_out]
-    return Contradiction(largest_misfit, best, exchanges, wrong, together=False)
+    best = min(explanations)[0]
+    explanations = [entry for entry in sorted(explanations) if entry[0] <= 3 * best]
+    exchanges = [pair for _, pair, _ in explanations if pair]
+    wrong = [k for *_, left_out in explanations for k in left_out]
+    return Contradiction(misfit_before, best, exchanges, wrong, all_at_once=False)
 
 
 def _agreeing(
@@ -196,21 +196,21 @@ def _agreeing(
         triples = [rng.choice(len(source), 3, replace=False) for _ in range(120)]
     best = np.zeros(len(source), bool)
     for triple in triples:
-        use = np.isin(np.arange(len(source)), triple)
-        misfit = _misfits(source, target, use)
-        if misfit is not None and (misfit < tolerance).sum() > best.sum():
-            best = misfit < tolerance
-    misfit = _misfits(source, target, best) if best.sum() >= 3 else None
-    return best if misfit is None else misfit < tolerance
+        is_used = np.isin(np.arange(len(source)), triple)
+        misfits = _misfits(source, target, is_used)
+        if misfits is not None and (misfits < tolerance).sum() > best.sum():
+            best = misfits < tolerance
+    misfits = _misfits(source, target, best) if best.sum() >= 3 else None
+    return best if misfits is None else misfits < tolerance
 
 
 def _misfits(
     source: Float[np.ndarray, "n 3"],
     target: Float[np.ndarray, "n 3"],
-    use: Bool[np.ndarray, " n"],
+    is_used: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"] | None:
     """Distances of points after the similarity of some of them; None: these are on a line."""
-    transformation = batched.similarity(source, target, use.astype(float))
+    transformation = batched.similarity(source, target, is_used.astype(float))
     if transformation is None:
         return None
     A, t = transformation

@@ -52,23 +52,25 @@ def _distances(
     Q = jnp.stack([_law_of_cosines(i, j, cosines[i, j]) for i, j in SIDES])
     # Two vectors μ across the sides: from any vector that is not along them. Squared sides are
     # positive, so that one with a negative component never is.
-    direction_1 = jnp.cross(sides, jnp.array([0.3, -0.5, 0.8]))
-    direction_2 = jnp.cross(sides, direction_1)
-    A, B = (jnp.tensordot(m / jnp.linalg.norm(m), Q, 1) for m in (direction_1, direction_2))
+    mu1 = jnp.cross(sides, jnp.array([0.3, -0.5, 0.8]))
+    mu2 = jnp.cross(sides, mu1)
+    A, B = (jnp.tensordot(m / jnp.linalg.norm(m), Q, 1) for m in (mu1, mu2))
     t, w, v = _pair_of_lines(A, B)
     plus, minus = jnp.sqrt(jnp.maximum(w[2], 0)), jnp.sqrt(jnp.maximum(-w[0], 0))
-    remainder = B - t * A
-    on_lines = [_meets(remainder, v[:, 1], minus * v[:, 2] + k * plus * v[:, 0]) for k in (1, -1)]
+    conic = B - t * A
+    on_lines = [
+        _intersect_conic(conic, v[:, 1], minus * v[:, 2] + k * plus * v[:, 0]) for k in (1, -1)
+    ]
     s = jnp.concatenate(on_lines)
     s = s * jnp.where(jnp.sum(s, 1) < 0, -1, 1)[:, None]
     length = jnp.einsum("ni,kij,nj->n", s, Q, s)
     s = s / jnp.sqrt(jnp.where(length > 0, length, 1))[:, None]
     s = jax.vmap(lambda s: _newton(s, Q, sides))(s)
-    wrong = jnp.max(jnp.abs(jnp.einsum("ni,kij,nj->nk", s, Q, s) - sides), axis=1)
+    misclosures = jnp.max(jnp.abs(jnp.einsum("ni,kij,nj->nk", s, Q, s) - sides), axis=1)
     # Squared sides have a sum of 1. Of 12 000 slots of random triangles none had a misclosure
     # between 1e-10 and 1e-8; with the centre on the danger cylinder, where two roots coincide, 0.1
     # %.
-    return s, (wrong < 1e-9) & jnp.all(s > 0, axis=1)
+    return s, (misclosures < 1e-9) & jnp.all(s > 0, axis=1)
 
 
 def _law_of_cosines(i: int, j: int, cosine: Float[Array, ""]) -> Float[Array, "3 3"]:
@@ -102,14 +104,14 @@ def _real_roots(
     a, b, c = c2 / c3, c1 / c3, c0 / c3
     p, q = b - a * a / 3, (2 * a * a / 27 - b / 3) * a + c
     discriminant = q * q / 4 + p**3 / 27
-    three = discriminant < 0
-    r = jnp.sqrt(jnp.where(three, -p / 3, 1))
+    has_three_roots = discriminant < 0
+    r = jnp.sqrt(jnp.where(has_three_roots, -p / 3, 1))
     angle = jnp.arccos(jnp.clip(-q / (2 * r**3), -1, 1)) / 3
     of_three = 2 * r * jnp.cos(angle - 2 * jnp.pi / 3 * jnp.arange(3))
-    root = jnp.sqrt(jnp.where(three, 0, discriminant))
+    root = jnp.sqrt(jnp.where(has_three_roots, 0, discriminant))
     u = jnp.cbrt(-q / 2 - jnp.where(q < 0, -root, root))
     of_one = u - p / jnp.where(u == 0, 1, 3 * u)
-    t = jnp.where(three, of_three, of_one) - a / 3
+    t = jnp.where(has_three_roots, of_three, of_one) - a / 3
     # Two Newton steps: Cardano's formula cancels where roots are nearly equal.
     for _ in range(2):
         slope = (3 * t + 2 * a) * t + b
@@ -117,7 +119,7 @@ def _real_roots(
     return t
 
 
-def _meets(
+def _intersect_conic(
     C: Float[Array, "3 3"], u: Float[Array, "3"], v: Float[Array, "3"]
 ) -> Float[Array, "2 3"]:
     """The two points α·u + β·v of a line on the conic C; the nearest real ones if it misses."""

@@ -76,8 +76,8 @@ class Exif:
     def camera(self) -> str:
         """Make and model without repetition."""
         first_word = self.make.split()[:1]
-        is_repeated = first_word and self.model.lower().startswith(first_word[0].lower())
-        return (self.model if is_repeated else f"{self.make} {self.model}").strip()
+        repeated = first_word and self.model.lower().startswith(first_word[0].lower())
+        return (self.model if repeated else f"{self.make} {self.model}").strip()
 
     def principal_distance(self) -> StatedDistance | None:
         """The principal distance in pixels of this file, whatever the size of the photograph as it
@@ -85,10 +85,10 @@ class Exif:
         # Without knowing which part of the sensor is left.
         if self.cropped:
             return None
-        long = max(self.size)
+        longer_side = max(self.size)
         width = sensor_width(self.make, self.model)
         if self.focal_length and width:
-            value, relative = self.focal_length / width * long, NOMINAL_SIGMA
+            value, relative = self.focal_length / width * longer_side, NOMINAL_SIGMA
             source = "focal length and sensor"
         elif self.focal_length_35:
             value = self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size)
@@ -123,14 +123,14 @@ def read_exif(path: str | Path) -> Exif:
     resolution = _positive(details.get(Tag.FocalPlaneXResolution))
     unit = RESOLUTION_UNIT.get(details.get(Tag.FocalPlaneResolutionUnit, 2))
     sides = (Tag.ExifImageWidth, Tag.ExifImageHeight)
-    exposed_sides = sorted(_positive(details.get(side)) or 0 for side in sides)
-    if resolution and exposed_sides[1]:
+    original_sides = sorted(_positive(details.get(side)) or 0 for side in sides)
+    if resolution and original_sides[1]:
         # Of the original photograph: programs that reduce it usually keep this.
-        resolution *= max(size) / exposed_sides[1]
+        resolution *= max(size) / original_sides[1]
     # The ratio of the sides differs by up to 2 % without a crop, from rounding and borders.
     cropped = (
-        exposed_sides[0] > 0
-        and abs(math.log(exposed_sides[1] / exposed_sides[0] * min(size) / max(size))) > 0.02
+        original_sides[0] > 0
+        and abs(math.log(original_sides[1] / original_sides[0] * min(size) / max(size))) > 0.02
     )
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     date = details.get(Tag.DateTimeOriginal) or head.get(Tag.DateTime)
@@ -144,7 +144,7 @@ def read_exif(path: str | Path) -> Exif:
         resolution=resolution / unit if resolution and unit else None,
         orientation=_orientation(head.get(Tag.Orientation)),
         time=_time(date, details.get(Tag.SubsecTimeOriginal)),
-        place=_place(gps, xmp),
+        place=_geographic_position(gps, xmp),
         attitude=xmp.attitude,
         cropped=cropped,
     )
@@ -181,7 +181,7 @@ def _time(value: Any, fraction: Any) -> datetime.datetime | None:
         return None
 
 
-def _place(gps: Mapping[int, Any], xmp: Xmp) -> GeographicPosition | None:
+def _geographic_position(gps: Mapping[int, Any], xmp: Xmp) -> GeographicPosition | None:
     from PIL.ExifTags import GPS
 
     latitude = _angle(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef))
@@ -190,11 +190,11 @@ def _place(gps: Mapping[int, Any], xmp: Xmp) -> GeographicPosition | None:
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         return None
     height = _number(gps.get(GPS.GPSAltitude))
-    is_below = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
+    is_below_sea = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
     return GeographicPosition(
         latitude,
         longitude,
-        None if height is None else -height if is_below else height,
+        None if height is None else -height if is_below_sea else height,
         xmp.sigma or _positive(gps.get(GPS.GPSHPositioningError)),
         xmp.sigma_height,
     )

@@ -16,7 +16,7 @@ HIDDEN = ("thumbs.db", "desktop.ini")
 
 def list_photographs(folder: Path) -> list[Path]:
     """The photographs in a folder, by name: also those whose format cannot be read."""
-    files = [p for p in _visible(folder) if p.is_file() and is_photograph(p)]
+    files = [p for p in _visible_files(folder) if p.is_file() and is_photograph(p)]
     # Raw and JPEG of one exposure have one name; the raw file alone is listed, and refused by name.
     readable_stems = {p.stem.lower() for p in files if p.suffix.lower() in SUFFIXES}
     return [p for p in files if p.suffix.lower() not in RAW or p.stem.lower() not in readable_stems]
@@ -24,34 +24,31 @@ def list_photographs(folder: Path) -> list[Path]:
 
 def describe_other_files(folder: Path) -> str:
     """The files and folders that are no photographs of their own, in words; empty if none."""
-    photographs, max_names = (
-        set(list_photographs(folder)),
-        6,
-    )  # names in a message of one or two lines
-    other_files = [p for p in _visible(folder) if p not in photographs]
-    folders_with_photographs = [
-        p for p in other_files if p.is_dir() and any(map(is_photograph, _visible(p)))
+    # Names in a message of one or two lines.
+    photographs, max_names = set(list_photographs(folder)), 6
+    other_paths = [p for p in _visible_files(folder) if p not in photographs]
+    photograph_folders = [
+        p for p in other_paths if p.is_dir() and any(map(is_photograph, _visible_files(p)))
     ]
-    raw = [p for p in other_files if p.is_file() and p.suffix.lower() in RAW]
-    remaining = [p for p in other_files if p.is_file() and p not in raw]
-    descriptions = []
+    raw = [p for p in other_paths if p.is_file() and p.suffix.lower() in RAW]
+    other_files = [p for p in other_paths if p.is_file() and p not in raw]
+    parts = []
     if raw:
-        descriptions.append(f"{count(len(raw), 'raw file')} beside photographs of the same name")
-    if folders_with_photographs:
-        names = ", ".join(f"{p.name}/" for p in folders_with_photographs[:max_names])
-        descriptions.append(
-            f"{count(len(folders_with_photographs), 'folder')} with photographs ({names}); give "
-            "them, too"
+        parts.append(f"{count(len(raw), 'raw file')} beside photographs of the same name")
+    if photograph_folders:
+        names = ", ".join(f"{p.name}/" for p in photograph_folders[:max_names])
+        parts.append(
+            f"{count(len(photograph_folders), 'folder')} with photographs ({names}); give them, too"
         )
-    if remaining:
-        kinds = Counter(p.suffix.lower() or "no suffix" for p in remaining)
-        common_kinds = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common(max_names))
+    if other_files:
+        kinds = Counter(p.suffix.lower() or "no suffix" for p in other_files)
+        kinds_text = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common(max_names))
         ellipsis = ", …" if len(kinds) > max_names else ""
-        descriptions.append(f"{count(len(remaining), 'other file')} ({common_kinds}{ellipsis})")
-    return f"{folder}: not read: {'; '.join(descriptions)}" if descriptions else ""
+        parts.append(f"{count(len(other_files), 'other file')} ({kinds_text}{ellipsis})")
+    return f"{folder}: not read: {'; '.join(parts)}" if parts else ""
 
 
-def _visible(folder: Path) -> list[Path]:
+def _visible_files(folder: Path) -> list[Path]:
     return sorted(
         p for p in folder.iterdir() if not p.name.startswith(".") and p.name.lower() not in HIDDEN
     )

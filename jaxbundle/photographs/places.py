@@ -53,10 +53,10 @@ def map_positions(
 ) -> MapPositions | None:
     """Positions in a projected system in metres, default the UTM zone; None if they are fewer than
     three, or the system has another unit."""
-    placed = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
-    if len(placed) < 3:
+    located = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
+    if len(located) < 3:
         return None
-    rows, known_places = [k for k, _ in placed], [place for _, place in placed]
+    rows, known_places = [k for k, _ in located], [place for _, place in located]
     latitude = np.array([p.latitude for p in known_places])
     longitude = np.array([p.longitude for p in known_places])
     system = system or utm_system(float(np.median(latitude)), float(np.median(longitude)))
@@ -69,14 +69,16 @@ def map_positions(
     extent = np.hypot(np.ptp(x), np.ptp(y))
     X, s = np.full((len(places), 3), np.nan), np.full((len(places), 3), np.nan)
     X[rows] = np.stack([x, y, height], 1)
-    high = [p.sigma_height or plane * SIGMA_HEIGHT / SIGMA for p, plane in zip(known_places, sigma)]
-    s[rows] = np.stack([sigma, sigma, high], 1)
-    turn = np.full(len(places), np.nan)
+    height_sigmas = [
+        p.sigma_height or plane * SIGMA_HEIGHT / SIGMA for p, plane in zip(known_places, sigma)
+    ]
+    s[rows] = np.stack([sigma, sigma, height_sigmas], 1)
+    convergence = np.full(len(places), np.nan)
     factors = _need_pyproj().Proj(system).get_factors(longitude, latitude)
-    turn[rows] = factors.meridian_convergence
+    convergence[rows] = factors.meridian_convergence
     # Over 8 σ three positions determine the direction to √2·σ/8σ = 10 degrees and the scale to 18 %
     is_wide = bool(extent > 8 * np.median(sigma))
-    return MapPositions(X, s, turn, system, is_wide)
+    return MapPositions(X, s, convergence, system, is_wide)
 
 
 def to_map(
@@ -93,16 +95,14 @@ def to_map(
         return X, f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}"
     pyproj = _need_pyproj()
     try:
-        known_system = pyproj.CRS.from_user_input(
-            "EPSG:4326" if system.upper() == "WGS84" else system
-        )
+        crs = pyproj.CRS.from_user_input("EPSG:4326" if system.upper() == "WGS84" else system)
     except pyproj.exceptions.ProjError:
         raise InputError(f"{where}: coordinate system {system!r} is not known") from None
-    if not known_system.is_geographic:
-        code = known_system.to_epsg()
-        return X, f"EPSG:{code}" if code else known_system.to_string()
+    if not crs.is_geographic:
+        code = crs.to_epsg()
+        return X, f"EPSG:{code}" if code else crs.to_string()
     target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
-    x, y = _transformer(known_system, target, where).transform(X[:, 0], X[:, 1])
+    x, y = _transformer(crs, target, where).transform(X[:, 0], X[:, 1])
     return np.stack([x, y, X[:, 2]], 1), target
 
 

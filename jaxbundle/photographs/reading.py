@@ -71,10 +71,10 @@ def read_photograph(
     large; `MemoryError`, which names it, if there is no memory for it.
     """
     with image_errors(path):
-        return _read(need_opencv(), path, colour)
+        return _read_pixels(need_opencv(), path, colour)
 
 
-def _read(
+def _read_pixels(
     cv2: ModuleType, path: str | Path, colour: bool
 ) -> UInt8[np.ndarray, "rows columns *channels"]:
     if not os.path.exists(path):
@@ -85,9 +85,9 @@ def _read(
     content = read_content(path, text=False)
     if not len(content):
         raise InputError(f"{path}: the file is empty")
-    if _looks_cut(content):
-        _refuse_cut(path, content)
-    _refuse_hollow(path, len(content))
+    if _is_truncated(content):
+        _refuse_truncated(path, content)
+    _refuse_oversized(path, len(content))
     colour_flag = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
     flags = colour_flag | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
@@ -168,7 +168,9 @@ def _open_any_size(file: str | Path | io.BytesIO) -> Any:
             Image.MAX_IMAGE_PIXELS = limit
 
 
-def _refuse_hollow(path: str | Path, size: int, harmless: int = 2**26, ratio: int = 2000) -> None:
+def _refuse_oversized(
+    path: str | Path, size: int, harmless: int = 2**26, ratio: int = 2000
+) -> None:
     """Refuse a header of more pixels than `size` bytes hold; `harmless`: pixels that are always
     decoded; `ratio`: for a byte, beyond them. DEFLATE packs 1032 bytes into one at most, JPEG 512
     pixels of one colour."""
@@ -182,7 +184,7 @@ def _refuse_hollow(path: str | Path, size: int, harmless: int = 2**26, ratio: in
         )
 
 
-def _looks_cut(content: bytes) -> bool:
+def _is_truncated(content: bytes) -> bool:
     """Whether a JPEG file has no end mark after its last scan, or a PNG file no end."""
     if content.startswith(START):
         return content.rfind(END) < content.rfind(SCAN)
@@ -191,7 +193,7 @@ def _looks_cut(content: bytes) -> bool:
     return content.startswith(b"\x89PNG") and b"IEND" not in content[-64:]
 
 
-def _refuse_cut(path: str | Path, content: bytes) -> None:
+def _refuse_truncated(path: str | Path, content: bytes) -> None:
     """Refuse a file that Pillow cannot decode to its end: the marks alone are no proof."""
     try:
         # Of a file Python makes room for as many bytes as a damaged length says; not of memory.
@@ -214,7 +216,7 @@ def _stretch(pixels: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"
     if pixels.dtype == np.uint8:
         return pixels
     # Every 64th pixel of a large photograph suffices for a percentile.
-    some = pixels[::8, ::8] if pixels.size > 2**20 else pixels
-    high = float(np.nanpercentile(some, 99.8))
-    scale = 255 / high if high > 0 else 1.0
+    sample = pixels[::8, ::8] if pixels.size > 2**20 else pixels
+    white_level = float(np.nanpercentile(sample, 99.8))
+    scale = 255 / white_level if white_level > 0 else 1.0
     return np.clip(np.nan_to_num(pixels * scale), 0, 255).astype(np.uint8)

@@ -90,14 +90,16 @@ WIDTHS = {
 def sensor_width(make: str, model: str) -> float | None:
     """The longer side of a camera's sensor in mm; None if it is not known."""
     make, model = make.lower().strip(), " ".join(model.lower().split())
-    first_word = make.split(" ")[0]
-    name = model if first_word and model.startswith(first_word) else f"{first_word} {model}"
+    brand = make.split(" ")[0]
+    name = model if brand and model.startswith(brand) else f"{brand} {model}"
     # A known name that continues with a digit is another camera: a D80 is not a D800.
-    goes_on = lambda known_name: known_name[-1].isdigit() and name[len(known_name) :][:1].isdigit()
-    similar_names = (
+    continues = lambda known_name: (
+        known_name[-1].isdigit() and name[len(known_name) :][:1].isdigit()
+    )
+    candidates = (
         known_name
         for known_name in WIDTHS
-        if name.startswith(known_name) and not goes_on(known_name)
+        if name.startswith(known_name) and not continues(known_name)
     )
-    best = max(similar_names, key=len, default=None)
+    best = max(candidates, key=len, default=None)
     return None if best is None else WIDTHS[best]

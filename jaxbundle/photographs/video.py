@@ -70,9 +70,9 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
     **Raises:** `InputError` if it is not a video."""
     cv2 = need_opencv()
     sharpness, thumbnails = [], []
-    with _opened(path) as video:
+    with _open_video(path) as video:
         rate = float(video.get(cv2.CAP_PROP_FPS))
-        stated_number = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 1)
+        frame_count = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 1)
         for grey in _grey_frames(video):
             small = _reduce(grey, settings.side).astype(np.float32)
             # Of the same view at another exposure it is the same; blur does not change the mean.
@@ -80,9 +80,7 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
             tiny = _reduce(small, settings.thumbnail).ravel()
             thumbnails.append((tiny - tiny.mean()) / max(float(tiny.std()), 1.0))
             if len(sharpness) % 32 == 0:
-                progress(
-                    f"frames of {path.name}", min(len(sharpness), stated_number), stated_number
-                )
+                progress(f"frames of {path.name}", min(len(sharpness), frame_count), frame_count)
     if not sharpness:
         raise InputError(f"{path}: a video without frames")
     # Some containers state no rate.
@@ -91,35 +89,37 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
 
 
 def choose_frames(
-    videos: Sequence[VideoLook], first: Sequence[int], settings: FrameSettings
+    videos: Sequence[VideoLook], first_frames: Sequence[int], settings: FrameSettings
 ) -> Int[np.ndarray, " n"]:
     """Instants at which the frames of all videos are sharp and differ, in order: frame numbers
-    after the `first` frame of each.
+    after the first frame of each, `first_frames`.
 
     **Raises:** `InputError` if there is none."""
-    length = min(len(v) - f for v, f in zip(videos, first))
+    length = min(len(v) - f for v, f in zip(videos, first_frames))
     # Blurred in one video is of no use in the others.
     sharp = np.ones(length, bool)
-    for video, skipped in zip(videos, first):
-        sharpness = video.sharpness[skipped : skipped + length]
+    for video, first_frame in zip(videos, first_frames):
+        sharpness = video.sharpness[first_frame : first_frame + length]
         sharp &= _is_sharp(sharpness, video.rate, settings)
     candidates = np.flatnonzero(sharp)
     if not len(candidates):
         raise InputError(
             f"{', '.join(str(v.path) for v in videos)}: no instant at which all are sharp"
         )
-    pictures = [v.thumbnail[f : f + length][candidates] for v, f in zip(videos, first)]
+    pictures = [v.thumbnail[f : f + length][candidates] for v, f in zip(videos, first_frames)]
     change = np.full(len(candidates), np.inf)
-    chosen_frames: list[int] = []
+    chosen_candidates: list[int] = []
     # Begins with the sharpest, relative to the brightness of its own video.
-    best = int(np.argmax(videos[0].sharpness[first[0] : first[0] + length][candidates]))
-    while len(chosen_frames) < settings.number and change[best] >= settings.min_change:
-        chosen_frames.append(best)
+    best = int(
+        np.argmax(videos[0].sharpness[first_frames[0] : first_frames[0] + length][candidates])
+    )
+    while len(chosen_candidates) < settings.number and change[best] >= settings.min_change:
+        chosen_candidates.append(best)
         # New in one video is new.
         difference = [np.sqrt(((p - p[best]) ** 2).mean(1)) for p in pictures]
         change = np.minimum(change, np.max(difference, axis=0))
         best = int(np.argmax(change))
-    return np.sort(candidates[chosen_frames])
+    return np.sort(candidates[chosen_candidates])
 
 
 def frames_of_video(path: Path) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
@@ -127,7 +127,7 @@ def frames_of_video(path: Path) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
 
     **Raises:** `InputError` if it is not a video, or has no frames."""
     empty = True
-    with _opened(path) as video:
+    with _open_video(path) as video:
         for grey in _grey_frames(video):
             empty = False
             yield grey
@@ -140,32 +140,34 @@ def file_of_frame(number: int) -> str:
     return f"frame_{number:06d}.png"
 
 
-def write_frames(path: Path, numbers: Int[np.ndarray, " n"], first: int, folder: Path) -> None:
-    """Write frames as `frame_000123.png`, counted from the `first`, without loss.
+def write_frames(
+    path: Path, numbers: Int[np.ndarray, " n"], first_frame: int, folder: Path
+) -> None:
+    """Write frames as `frame_000123.png`, counted from `first_frame`, without loss.
 
     **Raises:** `InputError` if the video ends before."""
     cv2 = need_opencv()
-    wanted_frames, number_written = set(numbers.tolist()), 0
+    frame_numbers, written_count = set(numbers.tolist()), 0
     folder.mkdir()
-    with _opened(path) as video:
+    with _open_video(path) as video:
         # One by one: to jump to a frame is inexact with most codecs.
         for number in range(int(numbers.max(initial=-1)) + 1):
             if not video.grab():
                 break
-            if number in wanted_frames:
-                is_there, frame = video.retrieve()
-                file = folder / file_of_frame(number - first)
-                if not is_there:
+            if number in frame_numbers:
+                is_read, frame = video.retrieve()
+                file = folder / file_of_frame(number - first_frame)
+                if not is_read:
                     break
                 content = cv2.imencode(".png", frame)[1]
                 file.write_bytes(content.tobytes())
-                number_written += 1
-    if number_written < len(wanted_frames):
+                written_count += 1
+    if written_count < len(frame_numbers):
         raise InputError(f"{path}: ends before frame {numbers.max()}, which was there before")
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_video(path: Path) -> Iterator[Any]:
     cv2 = need_opencv()
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -181,8 +183,8 @@ def _opened(path: Path) -> Iterator[Any]:
 def _grey_frames(video: Any) -> Iterator[UInt8[np.ndarray, "rows columns"]]:
     cv2 = need_opencv()
     while True:
-        is_there, frame = video.read()
-        if not is_there:
+        is_read, frame = video.read()
+        if not is_read:
             return
         yield cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
 
@@ -202,6 +204,6 @@ def _is_sharp(
 
     size = 2 * max(round(settings.window * rate / 2), 1) + 1
     sharpest = maximum_filter1d(sharpness, size, mode="nearest")
-    usual = np.median(sharpest)
+    typical_sharpness = np.median(sharpest)
     local = sharpness >= settings.min_sharpness * sharpest
-    return np.asarray(local & (sharpness >= settings.min_overall * usual))
+    return np.asarray(local & (sharpness >= settings.min_overall * typical_sharpness))

@@ -50,8 +50,8 @@ def parse_xmp(packet: bytes | str) -> Xmp:
     fields = _fields(packet)
     number = lambda name: _number(fields.get(name))
     attitude = _attitude(number)
-    plane = _largest([number(n) for n in ("RtkStdLon", "RtkStdLat", "GPSXYAccuracy")])
-    height = _largest([number(n) for n in ("RtkStdHgt", "GPSZAccuracy")])
+    plane = _largest_known([number(n) for n in ("RtkStdLon", "RtkStdLat", "GPSXYAccuracy")])
+    height = _largest_known([number(n) for n in ("RtkStdHgt", "GPSZAccuracy")])
     positive = lambda x: x if x and x > 0 else None
     return Xmp(attitude, positive(plane), positive(height))
 
@@ -74,7 +74,7 @@ def rotation_of(attitude: CameraAttitude, convergence: float = 0.0) -> Float[np.
 
 
 def _attitude(number: Callable[[str], float | None]) -> CameraAttitude | None:
-    stated_sigma = _largest([number(f"IMU{axis}Accuracy") for axis in PIX4D])
+    stated_sigma = _largest_known([number(f"IMU{axis}Accuracy") for axis in PIX4D])
     sigma = stated_sigma if stated_sigma and stated_sigma > 0 else SIGMA_ATTITUDE
     # The pitch of the horizon is 0 in DJI's tags, 90 in Pix4D's.
     for names, horizon in ((DJI, 0.0), (PIX4D, 90.0)):
@@ -90,21 +90,21 @@ def _fields(packet: bytes | str) -> Mapping[str, str]:
     """Attributes and elements by their names without namespace, the first of each."""
     content = packet if isinstance(packet, bytes) else packet.encode()
     # Packets have 64 KB at most within JPEG; a megabyte is far beyond what drones write.
-    rdf_match = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[: 2**20], re.DOTALL)
+    rdf = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[: 2**20], re.DOTALL)
     # Entities may grow without limit ("billion laughs"); no camera uses them.
-    head = content[: rdf_match.start()] if rdf_match else b""
-    if rdf_match is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
+    head = content[: rdf.start()] if rdf else b""
+    if rdf is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
         return {}
     # Some drones declare namespaces outside the part that is read.
-    spaces = dict(re.findall(r'xmlns:(\w+)="([^"]*)"', head.decode(errors="replace")))
-    text = rdf_match[0].decode(errors="replace")
-    opening = re.match(r"<[\w:]+", text)
-    missing_spaces = "".join(
-        f' xmlns:{s}="{u}"' for s, u in spaces.items() if f"xmlns:{s}=" not in text
+    namespaces = dict(re.findall(r'xmlns:(\w+)="([^"]*)"', head.decode(errors="replace")))
+    text = rdf[0].decode(errors="replace")
+    root_tag = re.match(r"<[\w:]+", text)
+    missing_declarations = "".join(
+        f' xmlns:{s}="{u}"' for s, u in namespaces.items() if f"xmlns:{s}=" not in text
     )
     try:
         root = ET.fromstring(
-            opening[0] + missing_spaces + text[opening.end() :] if opening else text
+            root_tag[0] + missing_declarations + text[root_tag.end() :] if root_tag else text
         )
     except ET.ParseError:
         return {}
@@ -125,6 +125,6 @@ def _number(text: str | None) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _largest(values: Sequence[float | None]) -> float | None:
-    known_values = [v for v in values if v is not None]
-    return max(known_values) if known_values else None
+def _largest_known(values: Sequence[float | None]) -> float | None:
+    numbers = [v for v in values if v is not None]
+    return max(numbers) if numbers else None

@@ -32,7 +32,10 @@ def planned_network(
     `design_block`; `control_sigma` object unit; `relief`: heights of tie points vary by ± this
     fraction of the flying height.
     """
-    counts = [_odd(length / step * 2) for length, step in zip(area, (design.base, design.spacing))]
+    counts = [
+        _odd_number_of_points(length / step * 2)
+        for length, step in zip(area, (design.base, design.spacing))
+    ]
     columns, rows = counts
     # A margin of points inside the area of 3 % of the footprint: relief of 2 % of the flying height
     # moves an image at the edge of the format, half a footprint from the nadir, by 1 % outwards.
@@ -43,8 +46,8 @@ def planned_network(
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     heights = np.random.default_rng(seed).uniform(-1, 1, len(grid)) * relief * design.height
     targets = np.concatenate([grid, heights[:, None]], axis=1)
-    control_along, control_across = (_control(n, control_every) for n in counts)
-    control = [row * columns + column for row in control_across for column in control_along]
+    control_columns, control_rows = (_control(n, control_every) for n in counts)
+    control = [row * columns + column for row in control_rows for column in control_columns]
     stations = aerial_block(
         design.strips,
         design.photographs_per_strip,
@@ -68,16 +71,16 @@ def planned_network(
     )
 
 
-def _control(points: int, every: int | None) -> list[int]:
+def _control(points: int, interval: int | None) -> list[int]:
     """Which points of a row, two per base, are control points, always including the last."""
-    if every is None:
+    if interval is None:
         return [0, points // 2, points - 1]
-    if every < 1:
-        raise InputError(f"control every {every} bases: expected a number from 1")
-    return sorted({*range(0, points, 2 * every), points - 1})
+    if interval < 1:
+        raise InputError(f"control every {interval} bases: expected a number from 1")
+    return sorted({*range(0, points, 2 * interval), points - 1})
 
 
-def _odd(steps: float) -> int:
+def _odd_number_of_points(steps: float) -> int:
     """An odd number of points for at least this many steps, so that control points can be at the
     middles; at least five, so that a point is between those of control."""
     n = max(5, math.ceil(steps - 1e-9) + 1)  # 3.0000000001 steps are three

@@ -118,15 +118,15 @@ def camera_rays(camera: Camera) -> Float[np.ndarray, "rows columns 3"]:
     parameters = tuple(float(values.get(name, 0.0)) for name in model.parameters)
     v, u = np.indices((rows + 1, columns + 1)).reshape(2, -1)
     x, y = ((a - o) / s for a, o, s in zip((u, v), origin, step))
-    out = np.empty((len(x), 3))
+    rays = np.empty((len(x), 3))
     # In batches of one size: one program for all sizes of photographs. Larger ones make small
     # photographs compute rays that are not used, smaller ones cost calls.
     batch = 1 << 16
     for begin in range(0, len(x), batch):
-        pixels_of_batch = np.minimum(np.arange(begin, begin + batch), len(x) - 1)
-        ray = np.stack(_rays(model, parameters, x[pixels_of_batch], y[pixels_of_batch]), -1)
-        out[begin : begin + batch] = ray[: len(x) - begin]
-    return out.reshape(rows + 1, columns + 1, 3)
+        batch_pixels = np.minimum(np.arange(begin, begin + batch), len(x) - 1)
+        ray = np.stack(_rays(model, parameters, x[batch_pixels], y[batch_pixels]), -1)
+        rays[begin : begin + batch] = ray[: len(x) - begin]
+    return rays.reshape(rows + 1, columns + 1, 3)
 
 
 def render_rays(
@@ -163,9 +163,9 @@ def first_hits(
 ) -> tuple[Float[np.ndarray, "rows columns"], Int[np.ndarray, "rows columns"]]:
     """Lengths of rays to the first surface, inf where there is none, and which one it is."""
     t = np.stack([shape.distances(o, d) for shape in scene.shapes])
-    nearest_surface = np.argmin(t, axis=0)
+    shape_index = np.argmin(t, axis=0)
     nearest = np.min(t, axis=0)
-    return nearest, np.where(np.isfinite(nearest), nearest_surface, -1)
+    return nearest, np.where(np.isfinite(nearest), shape_index, -1)
 
 
 def visible(
@@ -205,59 +205,55 @@ def _render_strip(
     Int[np.ndarray, "high columns"],
 ]:
     """Grey values without noise, points and surfaces of some rows."""
-    changes_of_direction = d[1:, :-1] - d[:-1, :-1], d[:-1, 1:] - d[:-1, :-1]
-    changes_of_origin = o[1:, :-1] - o[:-1, :-1], o[:-1, 1:] - o[:-1, :-1]
+    direction_steps = d[1:, :-1] - d[:-1, :-1], d[:-1, 1:] - d[:-1, :-1]
+    origin_steps = o[1:, :-1] - o[:-1, :-1], o[:-1, 1:] - o[:-1, :-1]
     o, d = o[:-1, :-1], d[:-1, :-1]
-    ray = np.all(np.isfinite(d + changes_of_direction[0] + changes_of_direction[1]), axis=-1)
+    ray = np.all(np.isfinite(d + direction_steps[0] + direction_steps[1]), axis=-1)
     t, surface = first_hits(scene, o, np.where(ray[..., None], d, NO_RAY))
     t, surface = np.where(ray, t, np.inf), np.where(ray, surface, -1)
     point = o + np.where(np.isfinite(t), t, np.nan)[..., None] * d
     grey = np.full(t.shape, float(sensor.background), np.float32)
     for k, (shape, texture) in enumerate(zip(scene.shapes, scene.textures)):
-        is_of_surface = surface == k
-        if is_of_surface.any():
-            length, X, ray = t[is_of_surface], point[is_of_surface], _first(d, is_of_surface)
+        mask = surface == k
+        if mask.any():
+            length, X, ray = t[mask], point[mask], _select_vectors(d, mask)
             # Slopes by differences over 1e-6 of the distance, a thousandth of a pixel: below the
             # root of rounding (1e-8 of the coordinates) they would be noise.
             tangent = shape.axes(X, 1e-6 * np.median(length))
             steps = [
                 _on_the_tangent_plane(
-                    tangent, length, ray, _first(b, is_of_surface), _first(a, is_of_surface)
+                    tangent, length, ray, _select_vectors(b, mask), _select_vectors(a, mask)
                 )
-                for a, b in zip(changes_of_direction, changes_of_origin)
+                for a, b in zip(direction_steps, origin_steps)
             ]
             value = _mean_of_a_pixel(shape, texture, X, steps, sensor.fine)
-            grey[is_of_surface] = sensor.offset + 255 * sensor.gain * value
+            grey[mask] = sensor.offset + 255 * sensor.gain * value
     return grey, point, surface
 
 
-def _first(
-    a: Float[np.ndarray, "rows columns 3"], chosen: Bool[np.ndarray, "rows columns"]
+def _select_vectors(
+    a: Float[np.ndarray, "rows columns 3"], mask: Bool[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "3 n"]:
     """The chosen vectors, coordinates first."""
-    return np.moveaxis(a[chosen], -1, 0).copy()
+    return np.moveaxis(a[mask], -1, 0).copy()
 
 
 def _on_the_tangent_plane(
     tangent: TangentPlane,
     t: Float[np.ndarray, " n"],
     d: Float[np.ndarray, "3 n"],
-    change_of_origin: Float[np.ndarray, "3 n"],
-    turned: Float[np.ndarray, "3 n"],
+    origin_step: Float[np.ndarray, "3 n"],
+    direction_step: Float[np.ndarray, "3 n"],
 ) -> Float[np.ndarray, "2 n"]:
     """How the texture's coordinates change to the next pixel, two arrays [n]: the next ray, whose
     origin is moved and whose direction is turned, meets the tangent plane (Igehy, 1999, eq. 10)."""
     normal, axes = tangent
-    shift = change_of_origin + t * turned
-    d = d + turned
-    along_normal = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
-    along_normal = np.where(
-        np.abs(along_normal) < 1e-9, 1e-9, along_normal
-    )  # a ray along the surface
-    depth_shift = (
-        normal[0] * shift[0] + normal[1] * shift[1] + normal[2] * shift[2]
-    ) / along_normal
-    return axes @ (shift - depth_shift * d)
+    shift = origin_step + t * direction_step
+    d = d + direction_step
+    normal_part = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
+    normal_part = np.where(np.abs(normal_part) < 1e-9, 1e-9, normal_part)  # a ray along the surface
+    retreat = (normal[0] * shift[0] + normal[1] * shift[1] + normal[2] * shift[2]) / normal_part
+    return axes @ (shift - retreat * d)
 
 
 def _mean_of_a_pixel(
@@ -269,12 +265,12 @@ def _mean_of_a_pixel(
 ) -> Float[np.ndarray, " n"]:
     """The mean of `fine` × `fine` samples over the parallelogram of a pixel; `steps`: its sides."""
     s, t = shape.coordinates(X)
-    step_down, step_right = steps
-    width = np.maximum(np.hypot(*step_down), np.hypot(*step_right)) / fine
+    row_step, column_step = steps
+    width = np.maximum(np.hypot(*row_step), np.hypot(*column_step)) / fine
     offsets = (np.arange(fine) + 0.5) / fine - 0.5
     total = np.zeros(len(s))
     for a in offsets:
         for b in offsets:
-            shift = a * step_down + b * step_right
+            shift = a * row_step + b * column_step
             total += texture(s + shift[0], t + shift[1], width)
     return total / fine**2

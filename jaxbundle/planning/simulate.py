@@ -161,10 +161,10 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
         text(key, value)
     cameras = make_cameras(camera)
     of_station = _camera_of_station(cameras, camera_of_station, len(stations))
-    begin = cameras if start is None else make_cameras(start, "start: ")
-    if len(begin) != len(cameras):
+    start_cameras = cameras if start is None else make_cameras(start, "start: ")
+    if len(start_cameras) != len(cameras):
         raise InputError(
-            f"start has {len(begin)} cameras, camera {len(cameras)}; give the same number"
+            f"start has {len(start_cameras)} cameras, camera {len(cameras)}; give the same number"
         )
     # Before any drawing, so that faults of arguments are reported without computing.
     role = _roles(len(targets), control, control_sigma, check)
@@ -172,17 +172,19 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
 
     rng = np.random.default_rng(seed)
     rays = _project_all(stations, targets, cameras, of_station, image_format)
-    is_chosen = np.ones(len(rays[0]), bool)
+    is_selected = np.ones(len(rays[0]), bool)
     if max_incidence is not None:
-        is_chosen = _facing(stations, targets, normals, *rays[:2]) >= np.cos(max_incidence)
+        is_selected = _incidence_cosines(stations, targets, normals, *rays[:2]) >= np.cos(
+            max_incidence
+        )
     if max_rays is not None:
-        is_chosen[is_chosen] = _draw_rays(rays[1][is_chosen], max_rays, rng)
+        is_selected[is_selected] = _draw_rays(rays[1][is_selected], max_rays, rng)
     # A control point is known: one ray is information about its image. Others need two.
-    need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
-    (image, point, xy), is_used = _select_imaged(rays, is_chosen, need)
-    row = np.cumsum(is_used) - 1
-    points = _points(targets, role, is_used, control_sigma)
-    ends = _ends(distances, len(targets), is_used, row)
+    required_rays = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
+    (image, point, xy), is_imaged = _select_imaged(rays, is_selected, required_rays)
+    row = np.cumsum(is_imaged) - 1
+    points = _points(targets, role, is_imaged, control_sigma)
+    ends = _ends(distances, len(targets), is_imaged, row)
     observations = Observations(
         image,
         row[point],
@@ -213,46 +215,46 @@ def simulate_with_truth(  # noqa: PLR0913 (public: a table of options, all but t
         object_unit=object_unit,
         image_unit=get_model(cameras[0].model).unit,
     )
-    towards = stations.position[image] - points.position[observations.point]
-    disturbance = _disturbance(disturb, towards)
-    return Simulation(_measure(truth, begin, sigma_xy, disturbance, rng), truth)
+    to_camera = stations.position[image] - points.position[observations.point]
+    disturbance = _disturbance(disturb, to_camera)
+    return Simulation(_measure(truth, start_cameras, sigma_xy, disturbance, rng), truth)
 
 
 def _select_imaged(
-    rays: Rays, is_chosen: Bool[np.ndarray, " rays"], need: Int[np.ndarray, " targets"]
+    rays: Rays, is_selected: Bool[np.ndarray, " rays"], required_rays: Int[np.ndarray, " targets"]
 ) -> tuple[list[np.ndarray], Bool[np.ndarray, " targets"]]:
     """The rays of targets with enough rays, and these targets.
 
     **Raises:** `InputError` where there are none."""
-    is_used = np.bincount(rays[1][is_chosen], minlength=len(need)) >= need
-    is_chosen = is_chosen & is_used[rays[1]]
-    if not is_chosen.any():
+    is_imaged = np.bincount(rays[1][is_selected], minlength=len(required_rays)) >= required_rays
+    is_selected = is_selected & is_imaged[rays[1]]
+    if not is_selected.any():
         raise InputError(
             "no target is imaged often enough; check the format, the units, and where the "
             "stations look"
         )
-    return [x[is_chosen] for x in rays], is_used
+    return [x[is_selected] for x in rays], is_imaged
 
 
 def _points(
     targets: Float[np.ndarray, "targets 3"],
     role: np.ndarray,
-    is_used: Bool[np.ndarray, " targets"],
+    is_imaged: Bool[np.ndarray, " targets"],
     control_sigma: float | Sequence[float],
 ) -> Points:
-    role, number = role[is_used], np.flatnonzero(is_used) + 1
+    role, number = role[is_imaged], np.flatnonzero(is_imaged) + 1
     sigma = np.full((len(role), 3), np.nan)
     if "control" in role:
         sigma[role == "control"] = np.broadcast_to(control_sigma, 3)
     source = Source("targets", number, "target")
     return Points(
-        tuple(map(str, number.tolist())), tuple(role.tolist()), targets[is_used], sigma, source
+        tuple(map(str, number.tolist())), tuple(role.tolist()), targets[is_imaged], sigma, source
     )
 
 
 def _measure(
     truth: Network,
-    begin: Sequence[Camera],
+    start_cameras: Sequence[Camera],
     noise: Float[np.ndarray, "2"],
     disturb: Float[np.ndarray, "3"],
     rng: np.random.Generator,
@@ -268,7 +270,7 @@ def _measure(
     position = images.position + disturb[0] * rng.standard_normal(images.position.shape)
     angles = images.angles + disturb[1] * rng.standard_normal(images.angles.shape)
     return truth.replace(
-        cameras=begin,
+        cameras=start_cameras,
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=points.position + scale * error),
         observations=dataclasses.replace(observations, xy=xy),
@@ -277,16 +279,16 @@ def _measure(
 
 
 def _camera_of_station(
-    cameras: Sequence[Camera], indices_given: Sequence[int] | None, stations: int
+    cameras: Sequence[Camera], camera_of_station: Sequence[int] | None, stations: int
 ) -> Int[np.ndarray, " images"]:
-    if indices_given is None:
+    if camera_of_station is None:
         if len(cameras) not in (1, stations):
             raise InputError(
                 f"{len(cameras)} cameras for {stations} stations; give camera_of_station, the "
                 "index of the camera of every station"
             )
         return np.arange(stations) % len(cameras)
-    indices = numeric_array("camera_of_station", indices_given, "indices of cameras")
+    indices = numeric_array("camera_of_station", camera_of_station, "indices of cameras")
     if indices.shape != (stations,) or not np.isin(indices, np.arange(len(cameras))).all():
         raise InputError(
             f"camera_of_station must be {stations} indices below {len(cameras)}, one for each "
@@ -354,7 +356,7 @@ def _disturbance(
 def _ends(
     distances: Sequence[tuple[int, int]],
     targets: int,
-    is_used: Bool[np.ndarray, " targets"],
+    is_imaged: Bool[np.ndarray, " targets"],
     row: Int[np.ndarray, " targets"],
 ) -> Int[np.ndarray, "n 2"]:
     """The ends of the distances as rows of the points used."""
@@ -369,12 +371,12 @@ def _ends(
     ends = ends.reshape(-1, 2)
     if not np.isin(ends, np.arange(targets)).all():
         raise InputError(f"distances name an index that is not among the {targets} targets")
-    for a, b in ends[~is_used[ends].all(1)][:1]:
+    for a, b in ends[~is_imaged[ends].all(1)][:1]:
         raise InputError(f"the distance from target {a + 1} to {b + 1}: too few images show it")
     return row[ends]
 
 
-def _facing(
+def _incidence_cosines(
     stations: Stations,
     targets: Float[np.ndarray, "targets 3"],
     normals: Float[np.ndarray, "targets 3"] | None,
@@ -409,9 +411,9 @@ def _draw_rays(
     """A mask that keeps at most this number of rays per point, drawn at random."""
     order = np.lexsort((rng.random(len(point)), point))
     sorted_point = point[order]
-    first_place = np.searchsorted(sorted_point, sorted_point)
+    starts = np.searchsorted(sorted_point, sorted_point)
     keep = np.empty(len(point), bool)
-    keep[order] = np.arange(len(point)) - first_place < max_rays
+    keep[order] = np.arange(len(point)) - starts < max_rays
     return keep
 
 
@@ -425,29 +427,29 @@ def _project_all(
     """All images of targets inside the format: image, point [rays], true coordinates [rays, 2]."""
     # Small networks are padded to 16 stations and 128 targets, larger ones to round numbers, so
     # that they share programs: compiling takes longer than projecting a million rays.
-    batches, number = [], len(targets)
-    wide = max(128, round_up(number))
-    targets = np.pad(targets, [(0, wide - number), (0, 0)], mode="edge")
+    parts, number = [], len(targets)
+    padded_targets = max(128, round_up(number))
+    targets = np.pad(targets, [(0, padded_targets - number), (0, 0)], mode="edge")
     for c, camera in enumerate(cameras):
         model = get_model(camera.model)
         values = {**default_parameters(model), **camera.parameters}
         p = tuple(float(values[name]) for name in model.parameters)
-        low, high = _format(camera, image_format)
+        low, high = _format_limits(camera, image_format)
         index = np.flatnonzero(of_station == c)
-        some = max(16, round_up(len(index)))
-        at_once = int(np.clip(RAYS_AT_ONCE // wide, 1, some))
+        padded_stations = max(16, round_up(len(index)))
+        at_once = int(np.clip(RAYS_AT_ONCE // padded_targets, 1, padded_stations))
         for begin in range(0, len(index), at_once):
             # The last batch is padded, so that all have one shape and compile once.
             batch = np.resize(index[begin : begin + at_once], at_once)
-            xy, is_invertible = _images_of(
+            xy, leads_back = _images_of(
                 model, p, stations.position[batch], stations.angles[batch], targets
             )
-            xy, is_invertible = np.asarray(xy)[:, :number], np.asarray(is_invertible)[:, :number]
-            is_inside = ((xy >= low) & (xy <= high)).all(-1) & is_invertible
+            xy, leads_back = np.asarray(xy)[:, :number], np.asarray(leads_back)[:, :number]
+            is_inside = ((xy >= low) & (xy <= high)).all(-1) & leads_back
             is_inside[len(index) - begin :] = False
             i, k = np.nonzero(is_inside)
-            batches.append((batch[i], k, xy[i, k]))
-    image, point, xy = (np.concatenate(columns) for columns in zip(*batches))
+            parts.append((batch[i], k, xy[i, k]))
+    image, point, xy = (np.concatenate(columns) for columns in zip(*parts))
     order = np.lexsort((point, image))
     return image[order], point[order], xy[order]
 
@@ -483,7 +485,7 @@ def _images_of(
     return jax.vmap(points, (0, 0, None, None, None))(matrices, position, *targets.T)
 
 
-def _format(
+def _format_limits(
     camera: Camera, image_format: tuple[float, float] | None
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Lowest and highest image coordinates, in the unit and axes of the camera's model."""

@@ -44,20 +44,20 @@ def simulate_further(
     """
     require_x64()
     random = np.random.default_rng(integer("seed", seed, least=0, most=LARGEST_SEED))
-    known_tables: set[str] = set()
+    table_names: set[str] = set()
     simulated = []
     for rows in require_network(network).further:
         field = rows.MEASURED
         declared = declare(truth.replace(further=(rows,)), np.zeros(3))
         # The network declares its tables for these rows alone: theirs are what `unknowns` may name.
         values = {t.name: t.value for t in declared.tables}
-        known_tables |= set(values)
+        table_names |= set(values)
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}
         if rows.CHANGES_IMAGE_POINTS:
             shift = _image_points(truth, rows, values) - truth.observations.xy
             network = _shift(network, truth, shift)
         if field:
-            rows = rows.among(truth)
+            rows = rows.restrict_to(truth)
             observation_set = next(
                 o for o in declared.observations if o.name in declared.further_sets
             )
@@ -71,9 +71,9 @@ def simulate_further(
             rows = dataclasses.replace(rows, **{field: measured + noise})
         simulated.append(rows)
     for name in unknowns or {}:
-        if name not in known_tables:
+        if name not in table_names:
             raise InputError(
-                f"unknowns: there is no table {name!r}; known: {', '.join(known_tables)}"
+                f"unknowns: there is no table {name!r}; known: {', '.join(table_names)}"
             )
     return network.replace(further=tuple(simulated))
 
@@ -107,8 +107,8 @@ def _image_points(
 
 def _shift(network: Network, truth: Network, shift: Float[np.ndarray, "rays 2"]) -> Network:
     rays, true_rays = network.observations, truth.observations
-    is_same = len(rays) == len(true_rays) and (rays.image == true_rays.image).all()
-    if not (is_same and (rays.point == true_rays.point).all()):
+    has_same_images = len(rays) == len(true_rays) and (rays.image == true_rays.image).all()
+    if not (has_same_images and (rays.point == true_rays.point).all()):
         raise InputError("simulate_further: network and truth have other image points")
     return network.replace(observations=dataclasses.replace(rays, xy=rays.xy + shift))
 
@@ -118,27 +118,27 @@ def _residuals(
 ) -> Float[np.ndarray, "n *residuals"]:
     """Computed minus measured of all observations of a set."""
     spaces = [next(t.space for t in tables if t.name == name) for name in observation_set.kind.of]
-    touched_values = [
+    block_values = [
         jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], values[name])
         for name, rows in zip(observation_set.kind.of, observation_set.rows)
     ]
-    residual_values = np.asarray(
-        _evaluate(observation_set.kind, tuple(spaces), touched_values, observation_set.measured)
+    residuals = np.asarray(
+        _evaluate(observation_set.kind, tuple(spaces), block_values, observation_set.measured)
     )
-    return residual_values.reshape(np.shape(jax.tree.leaves(observation_set.measured)[0]))
+    return residuals.reshape(np.shape(jax.tree.leaves(observation_set.measured)[0]))
 
 
 @partial(compile_once, static=(0, 1))
 def _evaluate(
-    kind: Kind, spaces: tuple[Space, ...], touched_values: Sequence[PyTree], measured: PyTree
+    kind: Kind, spaces: tuple[Space, ...], block_values: Sequence[PyTree], measured: PyTree
 ) -> Float[Array, "n residuals"]:
     def residuals_of(
-        touched_values: Sequence[PyTree], measured: PyTree
+        block_values: Sequence[PyTree], measured: PyTree
     ) -> Float[Array, " residuals"]:
-        blocks = [space.prepare(value) for space, value in zip(spaces, touched_values)]
+        blocks = [space.prepare(value) for space, value in zip(spaces, block_values)]
         return jnp.stack(evaluate(kind, blocks, measured))
 
-    return jax.vmap(residuals_of)(touched_values, scalars(measured))
+    return jax.vmap(residuals_of)(block_values, scalars(measured))
 
 
 def _noise(

@@ -87,8 +87,8 @@ def stations_looking_at(
             f"look_at must be finite coordinates [3], or {list(position.shape)}, one point for "
             f"each station, but is {show(look_at.tolist())}"
         )
-    vertical = vector("up", up, 3, "a direction X, Y, Z")
-    if not vertical.any():
+    up_direction = vector("up", up, 3, "a direction X, Y, Z")
+    if not up_direction.any():
         raise InputError("up must be a direction X, Y, Z, but is 0, 0, 0")
     angle = vector(
         "roll", roll, len(position), f"an angle, or one for each of {len(position)} stations"
@@ -101,10 +101,10 @@ def stations_looking_at(
     z = z / length
     # Where the camera looks along `up`, x is that of the object space: the cross product is zero
     # but for rounding.
-    x = np.cross(vertical, z)
-    is_along_vertical = np.linalg.norm(x, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(vertical)
-    x_axis = np.array([1.0, 0.0, 0.0])
-    x = np.where(is_along_vertical, x_axis - (z @ x_axis)[:, None] * z, x)
+    x = np.cross(up_direction, z)
+    is_parallel = np.linalg.norm(x, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(up_direction)
+    x_direction = np.array([1.0, 0.0, 0.0])
+    x = np.where(is_parallel, x_direction - (z @ x_direction)[:, None] * z, x)
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     y = np.cross(z, x)
     c, s = np.cos(angle), np.sin(angle)
@@ -136,8 +136,8 @@ def ring_of_stations(
         [radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(stations, height)], 1
     )
     # The n-th, 2n-th, … camera, so that the first one is upright.
-    turned = np.arange(1, stations + 1) % roll_every == 0 if roll_every else np.zeros(stations)
-    return stations_looking_at(middle + offset, middle, roll=np.pi / 2 * turned)
+    is_rolled = np.arange(1, stations + 1) % roll_every == 0 if roll_every else np.zeros(stations)
+    return stations_looking_at(middle + offset, middle, roll=np.pi / 2 * is_rolled)
 
 
 def aerial_block(
@@ -183,22 +183,17 @@ def aerial_block(
     # Strips are flown to and fro: images of every other one are turned by 180° about the vertical.
     base, spacing = size[0] * (1 - forward_overlap), size[1] * (1 - side_overlap)
     strip, place = np.divmod(np.arange(strips * images_per_strip), images_per_strip)
-    is_backward = strip % 2 == 1
-    position_along = base * (place - (images_per_strip - 1) / 2) * np.where(is_backward, -1, 1)
-    position_across = spacing * (strip - (strips - 1) / 2)
+    is_reversed = strip % 2 == 1
+    along = base * (place - (images_per_strip - 1) / 2) * np.where(is_reversed, -1, 1)
+    across = spacing * (strip - (strips - 1) / 2)
     c, s = np.cos(heading), np.sin(heading)
     offset = np.stack(
-        [
-            c * position_along - s * position_across,
-            s * position_along + c * position_across,
-            np.full(len(strip), float(height)),
-        ],
-        1,
+        [c * along - s * across, s * along + c * across, np.full(len(strip), float(height))], 1
     )
-    direction = np.where(is_backward, -1, 1)[:, None] * np.array([c, s, 0.0])
-    vertical = np.array([0.0, 0.0, 1.0])
-    x = np.cos(tilt) * direction + np.sin(tilt) * vertical
-    z = np.cos(tilt) * vertical - np.sin(tilt) * direction
+    direction = np.where(is_reversed, -1, 1)[:, None] * np.array([c, s, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    x = np.cos(tilt) * direction + np.sin(tilt) * up
+    z = np.cos(tilt) * up - np.sin(tilt) * direction
     return Stations(middle + offset, _angles(np.stack([x, np.cross(z, x), z], 1)))
 
 
@@ -247,11 +242,11 @@ def cloud_of_targets(
 ) -> Float[np.ndarray, "points 3"]:
     """Targets at random in a box of the given `size` (one edge, or three): [points, 3]."""
     points = integer("points", points)
-    half_edges = vector("size", size, 3, "one length of an edge, or three") / 2
-    if (half_edges < 0).any():
+    half_size = vector("size", size, 3, "one length of an edge, or three") / 2
+    if (half_size < 0).any():
         raise InputError(
-            f"size must be 0 or positive lengths, but is {show((2 * half_edges).tolist())}"
+            f"size must be 0 or positive lengths, but is {show((2 * half_size).tolist())}"
         )
     middle = vector("centre", centre, 3, COORDINATES)
     rng = np.random.default_rng(integer("seed", seed, least=0, most=LARGEST_SEED))
-    return middle + rng.uniform(-half_edges, half_edges, (points, 3))
+    return middle + rng.uniform(-half_size, half_size, (points, 3))

@@ -59,14 +59,14 @@ class Texture:
         self, s: Float[np.ndarray, " n"], t: Float[np.ndarray, " n"], width: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """Grey values of patches of the given widths at surface coordinates, object unit."""
-        out = np.empty(len(s))
+        grey_values = np.empty(len(s))
         # Batches of 2¹² to 2¹⁷ samples, whose arrays stay in the cache, take the same time; a
         # million at once takes twice as long.
         batch = 1 << 15
         for begin in range(0, len(s), batch):
             part = slice(begin, begin + batch)
-            out[part] = self._grey(s[part], t[part], width[part])
-        return out
+            grey_values[part] = self._grey(s[part], t[part], width[part])
+        return grey_values
 
     def _grey(
         self, s: Float[np.ndarray, " n"], t: Float[np.ndarray, " n"], width: Float[np.ndarray, " n"]
@@ -137,12 +137,12 @@ def _interpolate(
     total = np.zeros(len(x))
     for k in range(low.min(), min(low.max() + 1, len(pyramid) - 1) + 1):
         share = 1 - np.abs(level - k)
-        rows_of_level = np.flatnonzero(share > 0)
-        whole_chunk = len(rows_of_level) == len(x)
-        rows = slice(None) if whole_chunk else rows_of_level
+        indices = np.flatnonzero(share > 0)
+        whole_chunk = len(indices) == len(x)
+        selection = slice(None) if whole_chunk else indices
         size = 0.5**k
-        total[rows] += share[rows] * _bilinear(
-            pyramid[k], x[rows] * size - 0.5, y[rows] * size - 0.5
+        total[selection] += share[selection] * _bilinear(
+            pyramid[k], x[selection] * size - 0.5, y[selection] * size - 0.5
         )
     return total
 

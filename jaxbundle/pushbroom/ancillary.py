@@ -100,8 +100,8 @@ def attitude_table(
     """
     values = np.array(values, float)
     quaternions = values.ndim == 2 and values.shape[1] == 4
-    methods = tuple(m for m in (*METHODS, "slerp") if m != "hermite")
-    _check_method(method, methods, source)
+    allowed_methods = tuple(m for m in (*METHODS, "slerp") if m != "hermite")
+    _check_method(method, allowed_methods, source)
     if method == "slerp" and not quaternions:
         raise InputError(
             f"{source.name}: 'slerp' is for quaternions; interpolate angles by 'linear', "
@@ -170,18 +170,17 @@ def contradiction(
     trapezoid = (velocities[1:] + velocities[:-1]) / 2
     speed = np.linalg.norm(mean, axis=1)
     change = np.linalg.norm(np.diff(velocities, axis=0), axis=1)
-    difference = np.linalg.norm(mean - trapezoid, axis=1)
+    deviation = np.linalg.norm(mean - trapezoid, axis=1)
     # Velocities that are much too large excuse nothing.
-    tolerance_of_step = tolerance * np.median(speed) + np.minimum(change, speed) / 2
-    if not (bad := difference > tolerance_of_step).any():
+    limit = tolerance * np.median(speed) + np.minimum(change, speed) / 2
+    if not (bad := deviation > limit).any():
         return None
     k = int(bad.argmax())
     return VelocityContradiction(
         f"{source(k + 1)}: positions move by {speed[k]:.6g} m/s from the row before, velocities "
-        f"say {np.linalg.norm(trapezoid[k]):.6g} m/s, {difference[k]:.6g} m/s from that; expected "
-        "metres "
-        "a second in the frame of the positions",
-        float((4 / 27 * step * difference)[bad].max()),
+        f"say {np.linalg.norm(trapezoid[k]):.6g} m/s, {deviation[k]:.6g} m/s from that; expected "
+        "metres a second in the frame of the positions",
+        float((4 / 27 * step * deviation)[bad].max()),
     )
 
 
@@ -190,8 +189,8 @@ def continuous(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "r
 
     q and −q are one rotation, but between them interpolated components pass zero.
     """
-    is_same_sign = np.sum(quaternions[1:] * quaternions[:-1], 1) >= 0
-    return quaternions * np.cumprod(np.r_[1, np.where(is_same_sign, 1, -1)])[:, None]
+    has_same_sign = np.sum(quaternions[1:] * quaternions[:-1], 1) >= 0
+    return quaternions * np.cumprod(np.r_[1, np.where(has_same_sign, 1, -1)])[:, None]
 
 
 def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
@@ -200,8 +199,8 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
         raise InputError(f"{source(int(bad.argmax()))}: the time is not a finite number")
     if (bad := np.diff(times) <= 0).any():
         row = int(bad.argmax()) + 1
-        previous, time = times[row - 1 : row + 1]
-        fault = "occurs twice" if time == previous else f"comes after {previous:.15g} s"
+        previous_time, time = times[row - 1 : row + 1]
+        fault = "occurs twice" if time == previous_time else f"comes after {previous_time:.15g} s"
         raise InputError(
             f"{source(row)}: the time {time:.15g} s {fault}; sort the rows by time and keep "
             "each time once"
@@ -230,13 +229,13 @@ def warn_of_extrapolation(
     """
     limit, rounding = extrapolation_limit(rows, settings), settings.time_rounding
     check_span(rows, limit, times, source)
-    missing_before, missing_after = rows[0] - times.min(), times.max() - rows[-1]
-    if max(missing_before, missing_after) <= rounding:
+    start_excess, end_excess = rows[0] - times.min(), times.max() - rows[-1]
+    if max(start_excess, end_excess) <= rounding:
         return ()
     number = int(((times < rows[0] - rounding) | (times > rows[-1] + rounding)).sum())
     where = " and ".join(
         f"{value:.6g} s {text}"
-        for value, text in ((missing_before, "at its start"), (missing_after, "at its end"))
+        for value, text in ((start_excess, "at its start"), (end_excess, "at its end"))
         if value > rounding
     )
     return (
@@ -256,11 +255,11 @@ def check_span(
     is_outside = (times < rows[0] - extrapolate) | (times > rows[-1] + extrapolate)
     if is_outside.any():
         k = int(is_outside.argmax())
-        beyond = f"at most {extrapolate:.6g} s are" if extrapolate else "nothing is"
+        allowance = f"at most {extrapolate:.6g} s are" if extrapolate else "nothing is"
         raise InputError(
             f"{source.name}: {noun} {k} is at {times[k]:.9g} s, outside the table, "
-            f"{rows[0]:.9g} to {rows[-1]:.9g} s; give ancillary data for the whole image, {beyond} "
-            "extrapolated"
+            f"{rows[0]:.9g} to {rows[-1]:.9g} s; give ancillary data for the whole image, "
+            f"{allowance} extrapolated"
         )
 
 
@@ -275,9 +274,9 @@ def check_covered(
     check_span(rows, table.extrapolate, times, source, noun)
     # As in `interpolation.interval`, which decides for the image.
     i = np.clip(np.searchsorted(rows, times, side="right") - 1, 0, len(rows) - 2)
-    wide = rows[i + 1] - rows[i] > table.gap
-    if wide.any():
-        k = int(wide.argmax())
+    is_gap = rows[i + 1] - rows[i] > table.gap
+    if is_gap.any():
+        k = int(is_gap.argmax())
         start, end = rows[i[k]], rows[i[k] + 1]
         raise InputError(
             f"{source(i[k] + 1)}: {noun} {k} at {times[k]:.9g} s is in the gap of "
@@ -286,10 +285,11 @@ def check_covered(
         )
 
 
-def _check_method(method: str, methods: Sequence[str], source: Source) -> None:
-    if method not in methods:
+def _check_method(method: str, allowed_methods: Sequence[str], source: Source) -> None:
+    if method not in allowed_methods:
         raise InputError(
-            f"{source.name}: unknown interpolation {method!r}{did_you_mean(method, methods)}"
+            f"{source.name}: unknown interpolation "
+            f"{method!r}{did_you_mean(method, allowed_methods)}"
         )
 
 
@@ -301,19 +301,19 @@ def _table(
     order: int,
     gap: float | None,
     extrapolate: float,
-    noun: str,
+    quantity: str,
     source: Source,
 ) -> TimeTable:
     # Masked values are NaN, and refused with their row.
-    plain = lambda array: numeric_array(source.name, array, "numbers").astype(float)
-    times, values = plain(times), plain(values)
+    to_numbers = lambda array: numeric_array(source.name, array, "numbers").astype(float)
+    times, values = to_numbers(times), to_numbers(values)
     if values.ndim != 2 or times.shape != values.shape[:1]:
         raise InputError(
-            f"{source.name}: {times.shape} times and {noun}s of shape {values.shape}; one row of "
-            "values a time is expected"
+            f"{source.name}: {times.shape} times and {quantity}s of shape {values.shape}; one "
+            "row of values a time is expected"
         )
-    rates = None if rates is None else plain(rates)
-    for name, array in ((noun, values), ("velocity", rates)):
+    rates = None if rates is None else to_numbers(rates)
+    for name, array in ((quantity, values), ("velocity", rates)):
         if array is not None and (bad := ~np.isfinite(array).all(1)).any():
             raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
     if method in ("lagrange", "usgscsm") and order < 1:
@@ -326,8 +326,8 @@ def _table(
         )
     check_times(times, source)
     if method == "hermite" and rates is not None:
-        if wrong := contradiction(times, values, rates, source):
-            raise InputError(f"{wrong.message}, or another interpolation than 'hermite'")
+        if fault := contradiction(times, values, rates, source):
+            raise InputError(f"{fault.message}, or another interpolation than 'hermite'")
     if gap is not None and not gap > 0:
         raise InputError(
             f"{source.name}: gap is {gap:g}; the longest step that is interpolated, in seconds, "

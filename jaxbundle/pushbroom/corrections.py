@@ -65,7 +65,7 @@ class Corrections(NamedTuple):
 
 
 def true_direction(apparent: Vector, velocity: Vector) -> Triple:
-    """The unit vector l of light seen along `apparent`: c·l = k·seen − v, k > 0."""
+    """The unit vector l of light seen along `apparent`, a: c·l = k·a − v, k > 0."""
     a, b = dot(apparent, apparent), dot(apparent, velocity)
     c = dot(velocity, velocity) - LIGHT**2
     k = (b + jnp.sqrt(b * b - a * c)) / a
@@ -108,22 +108,22 @@ def refract(earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector) -> tu
     **Raises:** `ValueError` without an ellipsoid."""
     earth = require_ellipsoid(earth)
     start = geodetic(earth, o)[2]
-    both_heights = jnp.stack(jnp.broadcast_arrays(start, height))
-    (N1, N2), (above_start, above_ground) = (
-        (v[0], v[1]) for v in map(jnp.asarray, refractivity(both_heights))
+    heights = jnp.stack(jnp.broadcast_arrays(start, height))
+    (N1, N2), (integral1, integral2) = (
+        (v[0], v[1]) for v in map(jnp.asarray, refractivity(heights))
     )
     # N₂ − N₁ is the divisor of the mean: 1e-12 moves a ray by 1 µm in 1000 km
-    bends = (start > height) & (N2 - N1 > 1e-12)
-    step = jnp.where(bends, N2 - N1, 1.0)
-    mean = (above_ground - above_start - N1 * (start - height)) / step
+    is_bent = (start > height) & (N2 - N1 > 1e-12)
+    step = jnp.where(is_bent, N2 - N1, 1.0)
+    mean = (integral2 - integral1 - N1 * (start - height)) / step
     # The heights of the bending dN/dh have a standard deviation of 0.86 of their mean above the
     # ground at sea level, 0.88 at 3.4 km, 0.95 at 8.8 km in this atmosphere (1: exponential). Below
     # an aircraft the air ends at the aircraft: the upper border, 1 + √2 < 3 times the spread above
     # the mean, stays under it.
-    node_spread = jnp.minimum(0.88 * mean, (start - height - mean) / 3)
+    deviation = jnp.minimum(0.88 * mean, (start - height - mean) / 3)
     *ray, index = *o, *unit(d), N1
     for node, weight in NODES:
-        border = at_height(earth, height + mean + node * node_spread)
+        border = at_height(earth, height + mean + node * deviation)
         o, d = unpack(tuple(ray[:3])), unpack(tuple(ray[3:]))
         X = point_on_ray(o, d, ray_to_ellipsoid(border, o, d))
         n = normal(border, X)
@@ -132,8 +132,10 @@ def refract(earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector) -> tu
         # ratio² − 1, without cancellation.
         zeta = -change * (2 + 2 * index + change) / (1 + index + change) ** 2
         k = ratio * dot(d, n)
-        bent = point_on_ray(scale_vector(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k))
-        ray = [jnp.where(bends, new, old) for new, old in zip((*X, *bent), ray)]
+        bent_direction = point_on_ray(
+            scale_vector(ratio, d), n, zeta / (jnp.sqrt(k * k - zeta) - k)
+        )
+        ray = [jnp.where(is_bent, new, old) for new, old in zip((*X, *bent_direction), ray)]
         index = index + change
     return unpack(tuple(ray[:3])), unpack(tuple(ray[3:]))
 

@@ -75,7 +75,7 @@ def to_earth(
     pole = orientation.x_pole * ARCSECOND, orientation.y_pole * ARCSECOND
     # TEME: the equinox of GMST82; the same sidereal time that the elements were made with
     if frame == "TEME":
-        return erfa.pom00(*pole, 0.0) @ _about("z", -erfa.gmst82(*ut1)).as_matrix()
+        return erfa.pom00(*pole, 0.0) @ _rotations_about("z", -erfa.gmst82(*ut1)).as_matrix()
     matrices = erfa.c2t06a(*tt, *ut1, *pole)
     if frame == "J2000":
         # At the epoch J2000.0, as the frame is fixed.
@@ -179,7 +179,9 @@ def circular_orbit(
     r = radius + height
     rate = np.sqrt(GM / r**3)
     u = argument + rate * times
-    plane = _about("z", node - EARTH_RATE * times) * _about("x", np.array([inclination]))
+    plane = _rotations_about("z", node - EARTH_RATE * times) * _rotations_about(
+        "x", np.array([inclination])
+    )
     P = plane.apply(r * np.stack([np.cos(u), np.sin(u), 0 * u], 1))
     V = plane.apply(r * rate * np.stack([-np.sin(u), np.cos(u), 0 * u], 1))
     return P, V - np.cross([0, 0, EARTH_RATE], P)
@@ -201,5 +203,5 @@ def julian_date(epoch: str) -> tuple[float, float]:
     return 2451544.5 + days, (moment - midnight).total_seconds() / DAY
 
 
-def _about(axis: Literal["x", "z"], angles: Float[np.ndarray, " n"]) -> Rotation:
+def _rotations_about(axis: Literal["x", "z"], angles: Float[np.ndarray, " n"]) -> Rotation:
     return Rotation.from_euler(axis, angles[:, None])

@@ -52,13 +52,13 @@ def spread_positions(
     n = -(-least // (rows * columns))
     rng = np.random.default_rng(0)
     # Each row of cells deals its parts of the lines to its columns at random.
-    turns = rng.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
-    part = np.moveaxis(columns * np.arange(n)[:, None] + turns, 2, 1)
-    line_share = (part + rng.random(part.shape)) / (columns * n)
-    pixel_share = (np.arange(part.size).reshape(part.shape) * (np.sqrt(5) - 1) / 2) % 1
+    dealt_columns = rng.permuted(np.tile(np.arange(columns), (rows, n, 1)), axis=2)
+    part = np.moveaxis(columns * np.arange(n)[:, None] + dealt_columns, 2, 1)
+    line_fraction = (part + rng.random(part.shape)) / (columns * n)
+    pixel_fraction = (np.arange(part.size).reshape(part.shape) * (np.sqrt(5) - 1) / 2) % 1
     row, column = np.arange(rows)[:, None, None], np.arange(columns)[:, None]
     place = lambda within, cell, count, size: (cell + within) * size / count - 0.5
-    return place(line_share, row, rows, lines), place(pixel_share, column, columns, pixels)
+    return place(line_fraction, row, rows, lines), place(pixel_fraction, column, columns, pixels)
 
 
 class GroundAccuracy(eqx.Module):
@@ -76,8 +76,8 @@ class GroundAccuracy(eqx.Module):
     @property
     def overall(self) -> float:
         """The RMS over all positions whose rays meet the surface; NaN if there are none."""
-        known_rms = self.rms[np.isfinite(self.rms)]
-        return float(np.sqrt(np.mean(known_rms**2))) if len(known_rms) else np.nan
+        finite_rms = self.rms[np.isfinite(self.rms)]
+        return float(np.sqrt(np.mean(finite_rms**2))) if len(finite_rms) else np.nan
 
 
 def propagate_accuracy(
@@ -98,8 +98,8 @@ def propagate_accuracy(
     covariance = np.asarray(_covariances(image, surface, lines, pixels, sigma))
     rms = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     ce90 = np.array([circular_error(c) for c in covariance])
-    is_known = np.isfinite(rms)
-    overall_ce90 = circular_error(covariance[is_known]) if is_known.any() else np.nan
+    is_finite = np.isfinite(rms)
+    overall_ce90 = circular_error(covariance[is_finite]) if is_finite.any() else np.nan
     return GroundAccuracy(covariance, rms, ce90, overall_ce90)
 
 
@@ -114,16 +114,16 @@ def simulate_accuracy(
 ) -> GroundAccuracy:
     """The accuracy by Monte Carlo."""
     keys = jax.random.split(jax.random.key(seed), draws)
-    errors = np.asarray(_draws(image, surface, lines, pixels, sigmas(image, noise), keys))
+    errors = np.asarray(_simulate_errors(image, surface, lines, pixels, sigmas(image, noise), keys))
     covariance = np.einsum("dni,dnj->nij", errors, errors) / draws
     length = np.linalg.norm(errors, axis=2)
     rms = np.sqrt(np.mean(length**2, 0))
-    is_known = np.isfinite(rms)
+    is_finite = np.isfinite(rms)
     return GroundAccuracy(
         covariance,
         rms,
         np.quantile(length, 0.9, axis=0),
-        float(np.quantile(length[:, is_known], 0.9)) if is_known.any() else np.nan,
+        float(np.quantile(length[:, is_finite], 0.9)) if is_finite.any() else np.nan,
     )
 
 
@@ -135,7 +135,7 @@ def ground_errors(
     pixels: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 2"]:
     """East and north location errors of image positions, metres."""
-    return np.asarray(_differences(image, truth, surface, lines, pixels))
+    return np.asarray(_ground_differences(image, truth, surface, lines, pixels))
 
 
 def closed_form(
@@ -144,11 +144,11 @@ def closed_form(
     """The RMS over a line of a nadir-looking camera above a plane, for σ of its angles in
     radians."""
     V = np.tan(field_of_view / 2)
-    variance_across = (1 + 2 * V**2 / 3 + V**4 / 5) * roll**2
-    return float(height * np.sqrt(variance_across + pitch**2 + V**2 / 3 * yaw**2))
+    roll_term = (1 + 2 * V**2 / 3 + V**4 / 5) * roll**2
+    return float(height * np.sqrt(roll_term + pitch**2 + V**2 / 3 * yaw**2))
 
 
-def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -> float:
+def circular_error(covariance: Float[np.ndarray, "*n 2 2"], fraction: float = 0.9) -> float:
     """The radius of a circle that contains this fraction of normally distributed errors.
 
     For several covariances: of a mixture with equal weights.
@@ -161,13 +161,13 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
     # direction in axes of unit variance: a smooth periodic function, whose mean over equal steps
     # converges faster than any power of their number (2000 also serve λ₁ ≫ λ₂)
     angle = (np.arange(2000) + 0.5) * np.pi / 2000
-    small, great = variances.swapaxes(0, 1) / large
-    stretch = great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2
+    minor, major = variances.swapaxes(0, 1) / large
+    stretch = major * np.cos(angle) ** 2 + minor * np.sin(angle) ** 2
     # λ₂ = 0 leaves directions without extent; r²/1e-300 does not overflow and its exponential is 0
     stretch = np.maximum(stretch, 1e-300)
     # Ten times the largest σ is outside any fraction that double precision tells from 1.
-    excess_outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
-    return float(np.sqrt(large) * brentq(excess_outside, 0.0, 10.0))
+    excess = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - fraction)
+    return float(np.sqrt(large) * brentq(excess, 0.0, 10.0))
 
 
 @partial(compile_once, static=())
@@ -184,7 +184,7 @@ def _covariances(
     J. J has two rows and many columns, hence reverse mode.
     """
     no_rows = jnp.zeros((0, 3))
-    nothing = zero_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
+    no_errors = zero_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
     zero = jax.tree.map(jnp.zeros_like, sigma)
 
     def covariance_at(line: Scalar, pixel: Scalar) -> Float[Array, "2 2"]:
@@ -193,7 +193,7 @@ def _covariances(
         move = lambda errors: horizontal(
             axes,
             X0,
-            locate_point(add_errors(image, nothing._replace(**errors)), surface, line, pixel),
+            locate_point(add_errors(image, no_errors._replace(**errors)), surface, line, pixel),
         )
         J = jax.jacrev(move)(zero)
         parts = [(J[name] * sigma[name]).reshape(2, -1) for name in sigma]
@@ -207,7 +207,7 @@ def _covariances(
 
 
 @partial(compile_once, static=())
-def _draws(
+def _simulate_errors(
     image: PushbroomImage,
     surface: GroundSurface,
     lines: Float[AnyArray, " n"],
@@ -216,15 +216,15 @@ def _draws(
     keys: Shaped[AnyArray, " draws"],
 ) -> Float[Array, "draws n 2"]:
     def errors_of_draw(key: Shaped[AnyArray, ""]) -> Float[Array, "n 2"]:
-        wrong = add_errors(image, draw(sigma, key))
-        return _differences(wrong, image, surface, lines, pixels)
+        erring_image = add_errors(image, draw(sigma, key))
+        return _ground_differences(erring_image, image, surface, lines, pixels)
 
     # One draw after the other: a batch of draws would be as many copies of image and positions.
     return jax.lax.map(errors_of_draw, keys)
 
 
 @partial(compile_once, static=())
-def _differences(
+def _ground_differences(
     image: PushbroomImage,
     truth: PushbroomImage,
     surface: GroundSurface,

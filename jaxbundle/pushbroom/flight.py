@@ -160,8 +160,8 @@ def _samples(flight: Flight, rate: float) -> Float[np.ndarray, " rows"]:
     Lagrange's polynomial of degree 7 takes four on either side; two more keep the edges of the
     image away from the ends of a spline.
     """
-    last_line_time, margin = flight.period * (flight.lines - 1), 6
-    return np.arange(-margin, np.ceil(last_line_time * rate) + margin + 1) / rate
+    duration, margin = flight.period * (flight.lines - 1), 6
+    return np.arange(-margin, np.ceil(duration * rate) + margin + 1) / rate
 
 
 def _position(flight: Flight, rate: float, method: str) -> TimeTable:
@@ -223,9 +223,9 @@ def arc_between(
 
     **Raises:** `InputError` where both are on one line with the centre, which leaves the plane
     open."""
-    towards = np.stack([start, end]) - centre
-    r = np.linalg.norm(towards, axis=1)
-    u, v = towards / r[:, None]
+    from_centre = np.stack([start, end]) - centre
+    r = np.linalg.norm(from_centre, axis=1)
+    u, v = from_centre / r[:, None]
     sine = np.linalg.norm(np.cross(u, v))
     # Below this the direction of w is lost in the rounding of coordinates.
     if sine < 1e-12:

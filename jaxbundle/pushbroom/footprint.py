@@ -76,11 +76,11 @@ def make_footprint(
     heights = _heights(image, earth, settings.footprint_heights)
     if heights is None:
         return None
-    rows, number_across, layers = settings.footprint_lattice
+    rows, columns, layers = settings.footprint_lattice
     times = np.linspace(float(pieces.ends[0]), float(pieces.ends[-1]), rows)
-    u = np.linspace(-0.5, image.pixels - 0.5, number_across)
+    u = np.linspace(-0.5, image.pixels - 0.5, columns)
     xi, eta = (np.asarray(v) for v in slopes(image.optics, u))
-    k, tau = _places(pieces, times)
+    k, tau = _pieces_of_times(pieces, times)
     levels = np.linspace(heights[0], heights[1], layers)
     speeds = partial(_speeds_at, pieces, levels, line, earth, settings.times_at_once)
     D, _ = speeds(k, tau, xi, eta)
@@ -91,18 +91,18 @@ def make_footprint(
     period = float(image.times.time(1.0) - image.times.time(0.0))
     if not (errors <= settings.max_start_error * np.array([period, 1.0])).all():
         return None
-    reach = _slope_range(pieces, np.asarray(samples), D.reshape(-1, 3), settings.slope_margin)
-    if reach is None:
+    slope_range = _slope_range(pieces, np.asarray(samples), D.reshape(-1, 3), settings.slope_margin)
+    if slope_range is None:
         return None
     # Slopes of points of the footprint at all times, not only when they are seen.
-    xi = np.linspace(*reach, number_across)
+    xi = np.linspace(*slope_range, columns)
     eta = np.polynomial.polynomial.polyval(xi, np.asarray(line))
     k, within = np.indices((len(pieces.ends) - 1, len(TESTED_POSITIONS))).reshape(2, -1)
     _, speed = speeds(k, TESTED_POSITIONS[within], xi, eta)
     speed = speed[np.isfinite(speed)]  # a ray that misses sees no point
-    is_one_sign = speed.min() * speed.max() > 0
+    has_one_sign = speed.min() * speed.max() > 0
     steady = np.abs(speed).min() > settings.min_relative_speed * np.abs(speed).max()
-    return footprint if is_one_sign and steady else None
+    return footprint if has_one_sign and steady else None
 
 
 def _heights(
@@ -111,14 +111,14 @@ def _heights(
     """The height range of points; None if the camera is not above the ground."""
     P = np.asarray(image.trajectory.position.values)
     if earth is None:
-        height_above = P[:, 2].min()
+        altitude = P[:, 2].min()
     else:
         # The residual of a point scaled from the surface by 1 + a is (1 + a)² − 1.
-        height_above = (np.sqrt(1 + np.asarray(residual(earth, tuple(P.T)))).min() - 1) * earth.c
-    return np.clip(limits, -height_above / 2, height_above / 2) if height_above > 0 else None
+        altitude = (np.sqrt(1 + np.asarray(residual(earth, tuple(P.T)))).min() - 1) * earth.c
+    return np.clip(limits, -altitude / 2, altitude / 2) if altitude > 0 else None
 
 
-def _places(
+def _pieces_of_times(
     pieces: Pieces, times: Float[np.ndarray, " times"]
 ) -> tuple[Int[np.ndarray, " times"], Float[np.ndarray, " times"]]:
     """Pieces of times, and τ in them."""
@@ -140,12 +140,12 @@ def _speeds_at(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sights D [times, slopes, heights, 3] and ∂F/∂t [times, slopes, heights] at many times."""
     ends = np.asarray(pieces.ends)
-    half_lengths = (ends[k + 1] - ends[k]) / 2
+    half_length = (ends[k + 1] - ends[k]) / 2
     c = np.asarray(pieces.coefficients)[k]
     pad = lambda a: np.pad(a, [(0, -len(k) % batch)] + [(0, 0)] * (a.ndim - 1), mode="edge")
     parts = [
         _speeds(*part, pieces.origin, xi, eta, heights, line, earth)
-        for part in zip(*(pad(a).reshape(-1, batch, *a.shape[1:]) for a in (c, tau, half_lengths)))
+        for part in zip(*(pad(a).reshape(-1, batch, *a.shape[1:]) for a in (c, tau, half_length)))
     ]
     D, speed = (np.concatenate([np.asarray(v) for v in values])[: len(k)] for values in zip(*parts))
     return D, speed
@@ -216,7 +216,7 @@ def _slope_range(
     margin: float,
 ) -> tuple[float, float] | None:
     """Smallest and largest ξ of the points in the image, with a margin; None if out of sight."""
-    k, tau = _places(pieces, samples)
+    k, tau = _pieces_of_times(pieces, samples)
     c = np.asarray(pieces.coefficients)[k]
     numbers = np.einsum("kpn,pk->kn", c, tau ** np.arange(c.shape[1])[:, None])
     rsq = np.einsum("kij,nj->kni", numbers[:, :9].reshape(-1, 3, 3), D) + numbers[:, None, 9:]

@@ -32,7 +32,7 @@ from jaxbundle.pushbroom.corrections import Corrections, apparent_point
 from jaxbundle.pushbroom.detector_line import fit_line
 from jaxbundle.pushbroom.footprint import make_footprint
 from jaxbundle.pushbroom.image import LinePose, PushbroomImage, pose_at
-from jaxbundle.pushbroom.newton import first_of, gather, refine, replace_chosen
+from jaxbundle.pushbroom.newton import first_indices, gather, refine, scatter
 from jaxbundle.pushbroom.passages import find_passages
 from jaxbundle.pushbroom.pieces import make_pieces, sample, sample_times
 from jaxbundle.pushbroom.prepared import ScannerGeometry, Search, scanner_of
@@ -146,10 +146,12 @@ def project_from(
 def _project_from(
     image: ScannerGeometry, search: Search, X: Vector, line: Scalar, pixel: Scalar
 ) -> tuple[Array, Array]:
-    flat = [jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)]
+    flattened = [
+        jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)
+    ]
     refine_chunk = lambda args: refine(image, search, args[:3], *args[3:])
     size = batch_size(*search.settings.points_at_once)
-    t, u, settled = _map_chunks(refine_chunk, tuple(flat), size)
+    t, u, settled = _map_chunks(refine_chunk, tuple(flattened), size)
     shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in (*X, line, pixel)))
     settled_only = lambda a: jnp.where(settled, a, jnp.nan).reshape(shape)
     return settled_only(image.times.line(t)), settled_only(u)
@@ -222,14 +224,14 @@ def _map_chunks(
     if n <= size:
         return function(arrays)
     chunks = -(-n // size)
-    in_chunks = lambda a: jnp.pad(a, (0, chunks * size - n), mode="edge").reshape(chunks, size)
-    results = jax.lax.map(function, tuple(in_chunks(a) for a in arrays))
-    join_chunks = lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n]
-    return jax.tree.map(join_chunks, results)
+    to_chunks = lambda a: jnp.pad(a, (0, chunks * size - n), mode="edge").reshape(chunks, size)
+    values = jax.lax.map(function, tuple(to_chunks(a) for a in arrays))
+    from_chunks = lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n]
+    return jax.tree.map(from_chunks, values)
 
 
 def _find_positions(
-    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
+    image: ScannerGeometry, search: Search, X: Vector, max_positions: int, margin: float | Array
 ) -> Projected:
     """The positions of a chunk of points, a triple of arrays.
 
@@ -237,32 +239,34 @@ def _find_positions(
     the others are searched for in batches until none is left.
     """
     if search.footprint is None:
-        return _search(image, search, X, most, margin)
+        return _search(image, search, X, max_positions, margin)
     start = search.footprint.start(difference(X, search.pieces.origin))
     t, u, settled = refine(image, search, X, *start)
     # A position is known to be the only one in the image, between the heights, on this side of the
     # Earth; positions in the margin were not tested when the footprint was made.
-    is_once = (
-        settled & _is_inside(image, t, u, 0.0) & search.footprint.contains_height(search.earth, X)
+    is_unique = (
+        settled & _is_in_image(image, t, u, 0.0) & search.footprint.contains_height(search.earth, X)
     )
-    is_once &= _is_above(search, X)
-    single = lambda v: jnp.full((most, v.size), jnp.nan).at[0].set(v)
-    count = is_once.astype(int)
-    positions = Projected(single(image.times.line(t)), single(u), count, jnp.zeros_like(count))
+    is_unique &= _is_above_horizon(search, X)
+    in_first_place = lambda v: jnp.full((max_positions, v.size), jnp.nan).at[0].set(v)
+    count = is_unique.astype(int)
+    projected = Projected(
+        in_first_place(image.times.line(t)), in_first_place(u), count, jnp.zeros_like(count)
+    )
 
     def search_on(state: tuple[Projected, Array]) -> tuple[Projected, Array]:
-        positions, is_known = state
-        rows = first_of(
-            ~is_known, min(batch_size(*search.settings.searched_at_once), is_known.size)
+        projected, is_done = state
+        indices = first_indices(
+            ~is_done, min(batch_size(*search.settings.searched_at_once), is_done.size)
         )
-        searched = _search(image, search, gather(X, rows), most, margin)
-        return replace_chosen(positions, searched, rows), is_known.at[rows].set(True, mode="drop")
+        searched = _search(image, search, gather(X, indices), max_positions, margin)
+        return scatter(projected, searched, indices), is_done.at[indices].set(True, mode="drop")
 
-    return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (positions, is_once))[0]
+    return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (projected, is_unique))[0]
 
 
 def _search(
-    image: ScannerGeometry, search: Search, X: Vector, most: int, margin: float | Array
+    image: ScannerGeometry, search: Search, X: Vector, max_positions: int, margin: float | Array
 ) -> Projected:
     """The positions of arbitrary points."""
 
@@ -270,48 +274,48 @@ def _search(
         positions: tuple[Array, ...], args: tuple[Array, Array]
     ) -> tuple[tuple[Array, ...], None]:
         line, pixel, number, is_lost = positions
-        start, is_there = args
+        start, is_present = args
         middle = jnp.zeros_like(start) + (image.pixels - 1) / 2
         t, u, settled = jax.lax.cond(
-            jnp.any(is_there),
+            jnp.any(is_present),
             lambda: refine(image, search, X, start, middle),
             lambda: (start, start, start != start),
         )
-        is_seen = is_there & settled & _is_inside(image, t, u, margin)
-        is_this = is_seen & (number == jnp.arange(most)[:, None])
-        line = jnp.where(is_this, image.times.line(t), line)
+        is_seen = is_present & settled & _is_in_image(image, t, u, margin)
+        fills_place = is_seen & (number == jnp.arange(max_positions)[:, None])
+        line = jnp.where(fills_place, image.times.line(t), line)
         return (
             line,
-            jnp.where(is_this, u, pixel),
+            jnp.where(fills_place, u, pixel),
             number + is_seen,
-            is_lost | (is_there & ~settled),
+            is_lost | (is_present & ~settled),
         ), None
 
     def search_on(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        *positions, passages_tried, _, _, _, _ = state
-        starts, count, *where = find_passages(image, search, X, most, margin, passages_tried)
-        is_wanted = positions[2] < most
-        is_there = (count > passages_tried + jnp.arange(most)[:, None]) & is_wanted
+        *positions, tried_count, _, _, _, _ = state
+        starts, count, *where = find_passages(image, search, X, max_positions, margin, tried_count)
+        is_wanted = positions[2] < max_positions
+        is_present = (count > tried_count + jnp.arange(max_positions)[:, None]) & is_wanted
         # A loop: all passages share one compiled Newton's method.
-        positions, _ = jax.lax.scan(refine_passage, tuple(positions), (starts, is_there))
+        positions, _ = jax.lax.scan(refine_passage, tuple(positions), (starts, is_present))
         return (
             *positions,
-            jnp.where(is_wanted, passages_tried + most, passages_tried),
+            jnp.where(is_wanted, tried_count + max_positions, tried_count),
             count,
             *where,
         )
 
     def is_open(state: tuple[Array, ...]) -> Bool[Array, ""]:
-        _, _, number, _, passages_tried, count, *_ = state
-        return jnp.any((number < most) & (passages_tried < count))
+        _, _, number, _, tried_count, count, *_ = state
+        return jnp.any((number < max_positions) & (tried_count < count))
 
     # The first passages may be beside the line of detectors, and later ones in the image: the
     # search goes on after them until the places are full or no passage is left.
     zeros = jnp.zeros(jnp.shape(X[0]), int)
-    nan_positions, all_false = jnp.full((most, zeros.size), jnp.nan), zeros > 0
+    no_position, all_false = jnp.full((max_positions, zeros.size), jnp.nan), zeros > 0
     state = (
-        nan_positions,
-        nan_positions,
+        no_position,
+        no_position,
         zeros,
         all_false,
         zeros,
@@ -321,9 +325,9 @@ def _search(
         all_false,
     )
     state = jax.lax.while_loop(is_open, search_on, state)
-    line, pixel, number, is_lost, passages_tried, count, ahead, behind, hidden = state
+    line, pixel, number, is_lost, tried_count, count, ahead, behind, hidden = state
     # Passages after the last place were not refined: they may be outside the image.
-    number = number + jnp.maximum(count - passages_tried, 0)
+    number = number + jnp.maximum(count - tried_count, 0)
     # In the order of what explains most: hidden before lost, lost before beside.
     status = jnp.select(
         [number > 0, hidden, is_lost, count > 0, ahead, behind],
@@ -343,7 +347,7 @@ def _search(
     return Projected(line, pixel, number, status)
 
 
-def _is_inside(
+def _is_in_image(
     image: ScannerGeometry,
     t: Float[AnyArray, " n"],
     u: Float[AnyArray, " n"],
@@ -351,11 +355,11 @@ def _is_inside(
 ) -> Bool[AnyArray, "..."]:
     """Whether positions are in the image, or outside by up to `margin` lines and pixels."""
     edge = 0.5 + margin
-    begin, end = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
-    return (t >= begin) & (t < end) & (u >= -edge) & (u < image.pixels - 1 + edge)
+    first_time, last_time = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
+    return (t >= first_time) & (t < last_time) & (u >= -edge) & (u < image.pixels - 1 + edge)
 
 
-def _is_above(search: Search, X: Vector) -> bool | Bool[AnyArray, " n"]:
+def _is_above_horizon(search: Search, X: Vector) -> bool | Bool[AnyArray, " n"]:
     """Whether the camera is above the horizon of the points at the middle of the image."""
     if search.earth is None:
         return jnp.ones(jnp.shape(X[0]), bool)

@@ -99,9 +99,9 @@ def make_image(
     image = PushbroomImage(
         trajectory, times, optics, mounting, no_offsets(), corrections, int(lines), int(pixels)
     )
-    when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
+    line_times = np.asarray(times.time(jnp.arange(lines, dtype=float)))
     for table, source in zip((trajectory.position, trajectory.attitude.table), sources):
-        check_covered(table, when, source)
+        check_covered(table, line_times, source)
     return image
 
 

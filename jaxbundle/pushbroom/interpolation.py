@@ -118,8 +118,8 @@ def fraction(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
 def covers(table: TimeTable, i: Int[AnyArray, "..."], t: Scalar) -> Bool[AnyArray, "..."]:
     """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
-    is_inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
-    return is_inside & (times[i + 1] - times[i] <= table.gap)
+    is_between = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
+    return is_between & (times[i + 1] - times[i] <= table.gap)
 
 
 def span(table: TimeTable) -> tuple[float, float]:
@@ -152,11 +152,11 @@ def spline_rates(
     # Seen from behind, steps and slopes keep their signs.
     backward = _end_rows(step[::-1], slope[::-1], ends[-2::-1])
     backward = tuple(v[::-1] for v in backward)
-    zero, nothing = jnp.zeros(1), jnp.zeros((1, values.shape[1]))
-    step_before, step_after = jnp.concatenate([zero, step]), jnp.concatenate([step, zero])
+    zero, zero_row = jnp.zeros(1), jnp.zeros((1, values.shape[1]))
+    previous_step, next_step = jnp.concatenate([zero, step]), jnp.concatenate([step, zero])
     inner = 3 * (
-        step_after[:, None] * jnp.concatenate([nothing, slope])
-        + step_before[:, None] * jnp.concatenate([slope, nothing])
+        next_step[:, None] * jnp.concatenate([zero_row, slope])
+        + previous_step[:, None] * jnp.concatenate([slope, zero_row])
     )
     is_first, is_last = ends[:-1], ends[1:]
     choose = lambda at_first, at_last, within: jnp.where(
@@ -166,9 +166,9 @@ def spline_rates(
         is_first[:, None], forward[2], jnp.where(is_last[:, None], backward[2], inner)
     )
     return tridiagonal_solve(
-        choose(0.0, backward[1], step_after),
-        choose(forward[0], backward[0], 2 * (step_before + step_after)),
-        choose(forward[1], 0.0, step_before),
+        choose(0.0, backward[1], next_step),
+        choose(forward[0], backward[0], 2 * (previous_step + next_step)),
+        choose(forward[1], 0.0, previous_step),
         right,
     )
 
@@ -176,28 +176,28 @@ def spline_rates(
 def _end_rows(
     step: Float[Array, " intervals"],
     slope: Float[Array, "intervals k"],
-    is_end: Bool[Array, " intervals"],
+    is_last: Bool[Array, " intervals"],
 ) -> tuple[Array, Array, Array]:
     """Diagonal, coefficient of the next rate and right-hand side of each row as the first one.
 
-    `is_end` tells where a spline ends: not-a-knot needs four rows.
+    `is_last` tells where a spline ends: not-a-knot needs four rows.
     """
-    pad = lambda v, by: jnp.concatenate([v[by:], jnp.ones((1 + by, *v.shape[1:]))])
+    pad = lambda v, shift: jnp.concatenate([v[shift:], jnp.ones((1 + shift, *v.shape[1:]))])
     h0, h1, s0, s1 = pad(step, 0), pad(step, 1), pad(slope, 0), pad(slope, 1)
-    both_steps = h0 + h1
+    step_sum = h0 + h1
     # Not-a-knot: the third derivative is continuous at the second row, which combined with its own
     # equation leaves h₁·ẏ₀ + (h₀ + h₁)·ẏ₁ = knot (de Boor, 1978, chapter IV).
-    knot = (((h0 + 2 * both_steps) * h1)[:, None] * s0 + (h0**2)[:, None] * s1) / both_steps[
-        :, None
-    ]
-    parabola = s0 - (h0 / both_steps)[:, None] * (s1 - s0)
-    ending = lambda by: jnp.concatenate([is_end[by:], jnp.ones(by, bool)])
-    two, three = ending(1), ending(2)
-    short = is_end | two | three
+    knot = (((h0 + 2 * step_sum) * h1)[:, None] * s0 + (h0**2)[:, None] * s1) / step_sum[:, None]
+    parabola = s0 - (h0 / step_sum)[:, None] * (s1 - s0)
+    ending = lambda shift: jnp.concatenate([is_last[shift:], jnp.ones(shift, bool)])
+    has_two_rows, has_three_rows = ending(1), ending(2)
+    is_short = is_last | has_two_rows | has_three_rows
     right = jnp.where(
-        is_end[:, None], 0.0, jnp.where(two[:, None], s0, jnp.where(three[:, None], parabola, knot))
+        is_last[:, None],
+        0.0,
+        jnp.where(has_two_rows[:, None], s0, jnp.where(has_three_rows[:, None], parabola, knot)),
     )
-    return jnp.where(short, 1.0, h1), jnp.where(short, 0.0, both_steps), right
+    return jnp.where(is_short, 1.0, h1), jnp.where(is_short, 0.0, step_sum), right
 
 
 def _chebyshev(nodes: int) -> np.ndarray:
@@ -209,10 +209,10 @@ def _evaluate_piece(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[
     """Lagrange's formula through the nodes of Chebyshev, which are the same in every interval."""
     pieces = not_none(table.pieces)
     nodes = _chebyshev(pieces.shape[1])
-    is_same = np.eye(len(nodes), dtype=bool)
-    spans = nodes[:, None] - nodes + is_same
+    identity = np.eye(len(nodes), dtype=bool)
+    spans = nodes[:, None] - nodes + identity
     tau = fraction(table, i, t)
-    return jnp.prod(jnp.where(is_same, 1.0, (tau - nodes) / spans), axis=1) @ pieces[i]
+    return jnp.prod(jnp.where(identity, 1.0, (tau - nodes) / spans), axis=1) @ pieces[i]
 
 
 def _lagrange(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
@@ -221,20 +221,21 @@ def _lagrange(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array,
     first_row = jnp.clip(i + 1 - rows // 2, 0, len(table.times) - rows)
     times = jax.lax.dynamic_slice_in_dim(table.times, first_row, rows)
     values = jax.lax.dynamic_slice_in_dim(table.values, first_row, rows)
-    is_same = jnp.eye(rows, dtype=bool)
-    spans = times[:, None] - times + is_same
-    return jnp.prod(jnp.where(is_same, 1.0, (t - times) / spans), axis=1) @ values
+    identity = jnp.eye(rows, dtype=bool)
+    spans = times[:, None] - times + identity
+    return jnp.prod(jnp.where(identity, 1.0, (t - times) / spans), axis=1) @ values
 
 
 def _usgscsm(table: TimeTable, i: Int[AnyArray, ""], t: Scalar) -> Float[Array, " k"]:
-    """Lagrange's formula through 2·half rows, with weights 0 for the rest of a fixed number."""
-    half_window = (table.order + 1) // 2
-    half_rows = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), half_window)
-    offset = jnp.arange(-half_window, half_window) + 1
-    is_used = (offset > -half_rows) & (offset <= half_rows)
+    """Lagrange's formula through 2·`half_count` rows, with weights 0 for the rest of a fixed
+    number."""
+    max_half = (table.order + 1) // 2
+    half_count = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), max_half)
+    offset = jnp.arange(-max_half, max_half) + 1
+    is_used = (offset > -half_count) & (offset <= half_count)
     row = jnp.clip(i + offset, 0, len(table.times) - 1)
     times, values = table.times[row], table.values[row]
-    factor = ~jnp.eye(2 * half_window, dtype=bool) & is_used & is_used[:, None]
+    factor = ~jnp.eye(2 * max_half, dtype=bool) & is_used & is_used[:, None]
     spans = jnp.where(factor, times[:, None] - times, 1.0)
     weights = jnp.prod(jnp.where(factor, (t - times) / spans, 1.0), axis=1)
     return jnp.where(is_used, weights, 0.0) @ values

@@ -69,25 +69,17 @@ def covariance_lattice(
     levels = np.linspace(low, max(high, low + 1.0), size[0])
     lines = np.linspace(0, image.lines - 1, size[1])
     pixels = np.linspace(0, image.pixels - 1, size[2])
-    line_and_pixel = np.repeat(lines, size[2]), np.tile(pixels, size[1])
-    by_level = []
+    positions = np.repeat(lines, size[2]), np.tile(pixels, size[1])
+    components = []
     for level in levels:
-        covariance_inputs = (
-            image,
-            earth,
-            level,
-            *line_and_pixel,
-            errors.image,
-            errors.height,
-            errors.ground,
-        )
-        sigma = np.array(_ground_covariances(*covariance_inputs))
+        arguments = image, earth, level, *positions, errors.image, errors.height, errors.ground
+        sigma = np.array(_ground_covariances(*arguments))
         if isinstance(image, PushbroomImage) and any(np.any(s) for s in errors.noise):
             surface = Plane(level=level) if earth is None else Height(level=level, earth=earth)
-            sigma += propagate_accuracy(image, surface, *line_and_pixel, errors.noise).covariance
+            sigma += propagate_accuracy(image, surface, *positions, errors.noise).covariance
         parts = sigma[:, 0, 0], sigma[:, 1, 1], sigma[:, 0, 1]
-        by_level.append(np.stack(parts).reshape(3, *size[1:]))
-    return CovarianceLattice(levels, lines, pixels, np.stack(by_level, 1))
+        components.append(np.stack(parts).reshape(3, *size[1:]))
+    return CovarianceLattice(levels, lines, pixels, np.stack(components, 1))
 
 
 @partial(compile_once, static=1)
@@ -103,7 +95,7 @@ def _ground_covariances(
 ) -> Float[Array, "n 2 2"]:
     """The part of Σ that does not come from the ancillary data."""
 
-    def at(line: Scalar, pixel: Scalar) -> Float[Array, "2 2"]:
+    def covariance_at(line: Scalar, pixel: Scalar) -> Float[Array, "2 2"]:
         place = jnp.stack([line, pixel, level])
         X0 = _point(image, earth, place)
         axes = east_north(Ground(earth) if earth is not None else Plane(), unpack(X0))
@@ -111,7 +103,7 @@ def _ground_covariances(
         J = jax.jacfwd(offset)(place) * jnp.stack([sigma_image, sigma_image, sigma_height])
         return J @ J.T + sigma_ground**2 * jnp.eye(2)
 
-    return jax.vmap(at)(lines, pixels)
+    return jax.vmap(covariance_at)(lines, pixels)
 
 
 def _point(
@@ -149,7 +141,7 @@ def _interpolate(
         (value - axis[0]) / (axis[1] - axis[0]) for value, axis in zip((height, line, pixel), axes)
     ]
     # Of order 1: multilinear; half a pixel beyond the outer centres they are extended.
-    interpolated = lambda part: jax.scipy.ndimage.map_coordinates(
+    interpolate_part = lambda part: jax.scipy.ndimage.map_coordinates(
         part, places, order=1, mode="nearest"
     )
-    return jnp.stack([interpolated(part) for part in lattice.values])
+    return jnp.stack([interpolate_part(part) for part in lattice.values])

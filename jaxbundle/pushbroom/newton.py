@@ -36,29 +36,27 @@ def refine(
 ) -> tuple[AnyArray, AnyArray, Array]:
     """(t, u, settled) of points X, a triple of arrays [n], from times and pixels near by."""
     ends, settings = search.pieces.ends, search.settings
-    distance_in_time = settings.max_distance * image.line_period
+    margin = settings.max_distance * image.line_period
     n = t.size
     batch = min(n, batch_size(*settings.gathered_at_once))
 
     def is_open(state: RefinementState) -> Bool[Array, " n"]:
         t, _, settled, rounds = state
-        is_near = (t >= ends[0] - distance_in_time) & (t <= ends[-1] + distance_in_time)
+        is_near = (t >= ends[0] - margin) & (t <= ends[-1] + margin)
         return ~settled & is_near & (rounds < settings.max_rounds)
 
     def advance_all(state: RefinementState) -> RefinementState:
-        is_wanted, (*place, settled, rounds) = is_open(state), state
-        round_result = _make_round(image, search, X, *place)
-        t, u, settled = (
-            jnp.where(is_wanted, a, b) for a, b in zip(round_result, (*place, settled))
-        )
-        return t, u, settled, rounds + is_wanted
+        is_active, (*place, settled, rounds) = is_open(state), state
+        advanced = _make_round(image, search, X, *place)
+        t, u, settled = (jnp.where(is_active, a, b) for a, b in zip(advanced, (*place, settled)))
+        return t, u, settled, rounds + is_active
 
     def advance_few(state: RefinementState) -> RefinementState:
         *place, settled, rounds = state
-        rows = first_of(is_open(state), batch)
-        round_result = _make_round(image, search, *gather((X, *place), rows))
-        changed = replace_chosen((*place, settled), round_result, rows)
-        return *changed, rounds.at[rows].add(1, mode="drop")
+        indices = first_indices(is_open(state), batch)
+        advanced = _make_round(image, search, *gather((X, *place), indices))
+        changed = scatter((*place, settled), advanced, indices)
+        return *changed, rounds.at[indices].add(1, mode="drop")
 
     def advance(state: RefinementState) -> RefinementState:
         if n == batch:
@@ -72,21 +70,21 @@ def refine(
     return jax.lax.while_loop(lambda s: jnp.any(is_open(s)), advance, state)[:3]
 
 
-def first_of(is_wanted: Bool[Array, " n"], number: int) -> Int[Array, " few"]:
-    """The indices of the first `number` that are wanted; n where there are fewer."""
-    return jnp.nonzero(is_wanted, size=number, fill_value=is_wanted.size)[0]
+def first_indices(mask: Bool[Array, " n"], size: int) -> Int[Array, " few"]:
+    """The first `size` indices at which the mask is true; n where there are fewer."""
+    return jnp.nonzero(mask, size=size, fill_value=mask.size)[0]
 
 
-def gather(arrays: PyTree[Array], rows: Int[Array, " few"]) -> PyTree[Array]:
+def gather(arrays: PyTree[Array], indices: Int[Array, " few"]) -> PyTree[Array]:
     """Arrays [n] at indices; any value for n."""
-    return jax.tree.map(lambda a: a.at[rows].get(mode="clip"), arrays)
+    return jax.tree.map(lambda a: a.at[indices].get(mode="clip"), arrays)
 
 
-def replace_chosen(
-    arrays: PyTree[Array], values: PyTree[Array], rows: Int[Array, " few"]
+def scatter(
+    arrays: PyTree[Array], values: PyTree[Array], indices: Int[Array, " few"]
 ) -> PyTree[Array]:
     """Arrays [..., n] with values [..., few] at indices; those of n are dropped."""
-    return jax.tree.map(lambda a, v: a.at[..., rows].set(v, mode="drop"), arrays, values)
+    return jax.tree.map(lambda a, v: a.at[..., indices].set(v, mode="drop"), arrays, values)
 
 
 def _make_round(
@@ -108,13 +106,13 @@ def _make_round(
     in_piece = lambda a: a.at[piece].get(mode="promise_in_bounds")
     start, end = in_piece(pieces.ends[:-1]), in_piece(pieces.ends[1:])
     middle, half_length = (start + end) / 2, (end - start) / 2
-    tau = first_tau = (t - middle) / half_length
+    tau = start_tau = (t - middle) / half_length
     # One vector of each coefficient: a gather that goes into the arithmetic.
     c = [[in_piece(a) for a in power] for power in pieces.coefficients.transpose(1, 2, 0)]
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
-        numbers_and_rates = motion(numbers, [r / half_length for r in rates], pieces.origin)
-        X = image.apparent_position(search.earth, numbers_and_rates, X)
+        position_velocity = motion(numbers, [r / half_length for r in rates], pieces.origin)
+        X = image.apparent_position(search.earth, position_velocity, X)
         # Otherwise XLA recomputes it for each of the twelve sums below.
         X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)
@@ -133,13 +131,14 @@ def _make_round(
         dtau, dv = inverse * (gu * f - fu * g), inverse * (ft * g - gt * f)
         tau, v = tau - dtau, v - dv
         previous_step, step = step, jnp.maximum(jnp.abs(dtau) / line, jnp.abs(dv))
-    # Steps that shrink by step/before each leave about step²/before (geometric series). The second
-    # term lets a start at the solution settle, whose steps are rounding and do not shrink.
+    # Steps that shrink by step/previous_step each leave about step²/previous_step (geometric
+    # series). The second term lets a start at the solution settle, whose steps are rounding and do
+    # not shrink.
     tolerance = settings.position_tolerance
     settled = (step * step <= tolerance * (previous_step + tolerance)) & (q < 0)
     if image.corrections.any:
         # The sight refers to the time at the start of the round.
-        settled &= jnp.abs(tau - first_tau) < settings.sight_tolerance * line
+        settled &= jnp.abs(tau - start_tau) < settings.sight_tolerance * line
     # A root exactly at the end of a piece would alternate.
     reach = 1 + settings.piece_overlap * line
     settled &= ((tau >= -reach) | (piece == 0)) & ((tau <= reach) | (piece == last_piece))

@@ -49,15 +49,15 @@ def state_orbit(
     tolerance = 1e-12  # relative: 1e-5 m in a revolution
     # Forward and backward from the epoch: `solve_ivp` integrates in one direction.
     for part, order in ((times >= at, 1), (times < at, -1)):
-        when = np.sort(times[part])[::order]
-        if not len(when):
+        sorted_times = np.sort(times[part])[::order]
+        if not len(sorted_times):
             continue
         solution = solve_ivp(
             lambda _, y: np.r_[y[3:], acceleration(y[:3], j2)],
-            (at, when[-1]),
+            (at, sorted_times[-1]),
             start,
             "DOP853",
-            t_eval=when,
+            t_eval=sorted_times,
             rtol=tolerance,
             atol=tolerance * np.r_[np.full(3, 1e7), np.full(3, 1e4)],
             events=_ground,
@@ -65,15 +65,14 @@ def state_orbit(
         if solution.status:
             raise InputError(
                 f"state: the orbit reaches the ground at {solution.t_events[0][0]:.6g} s; check "
-                "the "
-                "velocity, its unit and frame"
+                "the velocity, its unit and frame"
             )
         # Times need not be sorted, but those of the integration are.
-        states[part] = solution.y.T[np.searchsorted(order * when, order * times[part])]
+        states[part] = solution.y.T[np.searchsorted(order * sorted_times, order * times[part])]
     # From the axes at the epoch to those that have turned since.
-    to_earth = Rotation.from_euler("z", -EARTH_RATE * (times - at)[:, None])
-    P = to_earth.apply(states[:, :3])
-    return P, to_earth.apply(states[:, 3:]) - np.cross(spin, P)
+    to_present = Rotation.from_euler("z", -EARTH_RATE * (times - at)[:, None])
+    P = to_present.apply(states[:, :3])
+    return P, to_present.apply(states[:, 3:]) - np.cross(spin, P)
 
 
 def acceleration(r: Float[np.ndarray, "3"], j2: bool = True) -> Float[np.ndarray, "3"]:

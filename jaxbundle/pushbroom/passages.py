@@ -39,55 +39,58 @@ def find_passages(
     """Approximate times of passages over the points, and their number; whether points are
     ahead of the last line, behind the first, or never above the horizon.
 
-    The times are those of the first `max_passages` passages after `passed_over` ones; the number is
-    that of all. The search begins and ends one line outside the image, to include its edges."""
+    The times are those of the first `max_passages` passages after `passed_over` ones; the number
+    is that of all. The search begins and ends one line outside the image, to include its edges.
+    """
     step = (1 + margin) * image.line_period
     samples = jnp.asarray(search.samples).at[0].add(-step).at[-1].add(step)
     numbers, rates, motions = jax.vmap(partial(sample, search.pieces))(samples)
     vertical = None if search.earth is None else normal(search.earth, X)
 
     def step_to(state: PassagesState, sample: SearchStep) -> tuple[PassagesState, None]:
-        previous, rate_before, t_before, count, starts, first_value, risen = state
+        value_before, rate_before, t_before, count, starts, first_value, has_risen = state
         k, t, numbers, rates, motion = sample
         D = difference(image.apparent_position(search.earth, motion, X), search.pieces.origin)
         ahead = lambda numbers: slope_ahead(numbers, D, search.detector_line)[0]
         value, rate = jax.jvp(ahead, (numbers,), (rates,))
         if vertical is not None:
             is_above = dot(vertical, difference(motion[0], X)) > 0
-            value, risen = jnp.where(is_above, value, jnp.nan), risen | is_above
+            value, has_risen = jnp.where(is_above, value, jnp.nan), has_risen | is_above
         h = t - t_before
-        is_once, is_twice, places = _find_zeros(previous, value, rate_before * h, rate * h)
-        new = is_once + 2 * is_twice
+        crosses_once, crosses_twice, places = _find_zeros(
+            value_before, value, rate_before * h, rate * h
+        )
+        crossings = crosses_once + 2 * crosses_twice
         starts = tuple(
             jnp.select(
-                [(count + j == i) & (new > j) for j in range(2)],
+                [(count + j == i) & (crossings > j) for j in range(2)],
                 [t_before + h * s for s in places],
                 start,
             )
             for i, start in enumerate(starts)
         )
         first_value = jnp.where(k == 0, value, first_value)
-        return (value, rate, t, count + new, starts, first_value, risen), None
+        return (value, rate, t, count + crossings, starts, first_value, has_risen), None
 
     zero = jnp.zeros_like(X[0])
-    nowhere, never = zero * jnp.nan, zero > 1
+    no_value, all_false = zero * jnp.nan, zero > 1
     state = (
-        nowhere,
+        no_value,
         zero,
         samples[0],
         -passed_over,
         (zero,) * max_passages,
-        nowhere,
-        never if vertical is not None else ~never,
+        no_value,
+        all_false if vertical is not None else ~all_false,
     )
     # Four steps of plain sights a turn hide the cost of the loop; steps with corrections are long
     # enough, and four of them only take longer to compile.
     unroll = 1 if image.corrections.any else 4
-    (final, _, _, further, starts, first_value, risen), _ = jax.lax.scan(
+    (final, _, _, remaining_count, starts, first_value, has_risen), _ = jax.lax.scan(
         step_to, state, (jnp.arange(len(samples)), samples, numbers, rates, motions), unroll=unroll
     )
     # NaN at an end, where the point is behind the camera, is neither ahead nor behind
-    return jnp.stack(starts), further + passed_over, final > 0, first_value < 0, ~risen
+    return jnp.stack(starts), remaining_count + passed_over, final > 0, first_value < 0, ~has_risen
 
 
 def _find_zeros(
@@ -95,10 +98,10 @@ def _find_zeros(
 ) -> tuple[Array, Array, tuple[Array, Array]]:
     """Whether a function crosses zero once or twice from 0 to 1, and approximately where; from its
     values and rates at both ends (cubic), false if one is NaN."""
-    is_known = ~(jnp.isnan(a) | jnp.isnan(b))
-    is_once = is_known & ((a >= 0) != (b >= 0))
-    single_zero = a / jnp.where(is_once, a - b, 1.0)
-    turns = is_known & ~is_once & (a * da < 0) & (b * db > 0)
+    is_defined = ~(jnp.isnan(a) | jnp.isnan(b))
+    crosses_once = is_defined & ((a >= 0) != (b >= 0))
+    linear_zero = a / jnp.where(crosses_once, a - b, 1.0)
+    turns = is_defined & ~crosses_once & (a * da < 0) & (b * db > 0)
     # The zero of the rate, c + 2h·s + k·s², between ends of different sign; q avoids the
     # cancellation of −h ± √(h² − ck) (Press et al., 2007, Numerical Recipes, section 5.6).
     rise = b - a
@@ -107,8 +110,12 @@ def _find_zeros(
     s = c / jnp.where(turns, q, 1.0)
     s = jnp.where((s > 0) & (s < 1), s, q / jnp.where(turns & (k != 0), k, 1.0))
     turn = a + s * (da + s * (h + s * k / 3))
-    twice = turns & ((turn >= 0) != (a >= 0))
+    crosses_twice = turns & ((turn >= 0) != (a >= 0))
     # A parabola on each side of the turn.
-    part = lambda end: jnp.sqrt(turn / jnp.where(twice, turn - end, 1.0))
+    part = lambda end: jnp.sqrt(turn / jnp.where(crosses_twice, turn - end, 1.0))
     first_zero, second_zero = s * (1 - part(a)), s + (1 - s) * part(b)
-    return is_once, twice, (jnp.where(is_once, single_zero, first_zero), second_zero)
+    return (
+        crosses_once,
+        crosses_twice,
+        (jnp.where(crosses_once, linear_zero, first_zero), second_zero),
+    )

@@ -70,24 +70,26 @@ def make_pieces(
 
     **Raises:** `InputError` if no pieces represent the trajectory.
     """
-    begin, end = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
-    line = (end - begin) / image.lines
+    first_time, last_time = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    line = (last_time - first_time) / image.lines
     tables = image.trajectory.position, image.trajectory.attitude.table
     starts, ends = zip(*(span(table) for table in tables))
-    begin, end = max(begin, *starts), min(end, *ends)
+    first_time, last_time = max(first_time, *starts), min(last_time, *ends)
     nodes = np.unique(np.concatenate([breaks(table) for table in tables]))
     equal = settings.equal_times * line
-    nodes = nodes[(nodes > begin + equal) & (nodes < end - equal)]
-    ends = np.r_[begin, nodes[np.diff(nodes, prepend=-np.inf) > equal], end]
-    origin, reach, per_radian = _middle_sight(image, earth)
+    nodes = nodes[(nodes > first_time + equal) & (nodes < last_time - equal)]
+    ends = np.r_[first_time, nodes[np.diff(nodes, prepend=-np.inf) > equal], last_time]
+    origin, sight_length, per_radian = _middle_sight(image, earth)
     piece_starts, piece_ends, pieces = ends[:-1], ends[1:], []
     while len(piece_starts):
         values, checks = _pose_numbers_of_pieces(
-            image, origin, piece_starts, piece_ends, (begin, end), settings.times_at_once
+            image, origin, piece_starts, piece_ends, (first_time, last_time), settings.times_at_once
         )
-        wrong = np.abs(TO_CHECKS @ values - checks)
+        deviations = np.abs(TO_CHECKS @ values - checks)
         # Turns act on the whole sight, shifts over its length.
-        error = per_radian * (wrong[..., :9].max((1, 2)) + wrong[..., 9:].max((1, 2)) / reach)
+        error = per_radian * (
+            deviations[..., :9].max((1, 2)) + deviations[..., 9:].max((1, 2)) / sight_length
+        )
         good = error <= settings.piece_tolerance
         pieces += zip(piece_starts[good], piece_ends[good], TO_COEFFICIENTS @ values[good])
         # A rough trajectory, or a wrong row, would be halved for ever.
@@ -95,29 +97,28 @@ def make_pieces(
         if len(piece_starts) and (piece_ends - piece_starts).min() < settings.min_piece * line:
             raise InputError(
                 f"attitude: the trajectory at {piece_starts[0]:.9g} s does not follow from its "
-                "rows within "
-                f"{settings.min_piece:g} lines; look for wrong rows there"
+                f"rows within {settings.min_piece:g} lines; look for wrong rows there"
             )
         middle = (piece_starts + piece_ends) / 2
         piece_starts, piece_ends = np.r_[piece_starts, middle], np.r_[middle, piece_ends]
     shared = len(pieces) <= settings.max_shared_pieces
-    number_added = round_up(len(pieces)) - len(pieces) if shared else 0
+    extra_count = round_up(len(pieces)) - len(pieces) if shared else 0
     # A half has the same polynomial: pieces that only fill up move no position.
-    pieces = _halve_some(pieces, number_added)
+    pieces = _halve_some(pieces, extra_count)
     coefficients = jnp.asarray(np.stack([piece[2] for piece in pieces]))
     return Pieces(
-        jnp.asarray(np.r_[[p[0] for p in pieces], end]), coefficients, jnp.asarray(origin)
+        jnp.asarray(np.r_[[p[0] for p in pieces], last_time]), coefficients, jnp.asarray(origin)
     )
 
 
 def _halve_some(pieces: list[Piece], number: int) -> list[Piece]:
     """Pieces (start, end, coefficients) in order of time, some of the longest halved."""
     pieces = sorted(pieces, key=lambda piece: piece[1] - piece[0])
-    unhalved, long = pieces[: len(pieces) - number], pieces[len(pieces) - number :]
-    for start, end, c in long:
+    result, longest = pieces[: len(pieces) - number], pieces[len(pieces) - number :]
+    for start, end, c in longest:
         middle = (start + end) / 2
-        unhalved += [(start, middle, TO_HALVES[0] @ c), (middle, end, TO_HALVES[1] @ c)]
-    return sorted(unhalved, key=lambda piece: piece[0])
+        result += [(start, middle, TO_HALVES[0] @ c), (middle, end, TO_HALVES[1] @ c)]
+    return sorted(result, key=lambda piece: piece[0])
 
 
 def _pose_numbers_of_pieces(
@@ -150,12 +151,12 @@ def _pose_numbers(
 
 
 def sample_times(pieces: Pieces, max_steps: int) -> Float[AnyArray, " k"]:
-    """Ends of pieces, `max_steps` steps at most."""
-    last_piece = len(pieces.ends) - 1
-    ends_chosen = np.unique(
-        np.linspace(0, last_piece, min(max_steps, last_piece) + 1).round().astype(int)
+    """Ends of pieces, with at most `max_steps` steps between them."""
+    last_index = len(pieces.ends) - 1
+    indices = np.unique(
+        np.linspace(0, last_index, min(max_steps, last_index) + 1).round().astype(int)
     )
-    return pieces.ends[ends_chosen]
+    return pieces.ends[indices]
 
 
 def sample(pieces: Pieces, t: Scalar) -> tuple[Array, Array, tuple[Triple, Triple]]:
@@ -195,8 +196,8 @@ def _middle_sight(
     else:
         s = float(ray_to_ellipsoid(earth, P, d))
     # Looking at the sky or into the ground: a kilometre serves to weigh turns against shifts.
-    reach = s if np.isfinite(s) and s > 0 else 1e3
+    sight_length = s if np.isfinite(s) and s > 0 else 1e3
     period = float(image.times.time(1.0) - image.times.time(0.0))
     # Not zero: a camera may stand still.
-    advance = max(float(np.linalg.norm(V)) * period / reach, 1e-12)
-    return P + reach * np.array(d), reach, max(1 / float(per_pixel), 1 / advance)
+    advance = max(float(np.linalg.norm(V)) * period / sight_length, 1e-12)
+    return P + sight_length * np.array(d), sight_length, max(1 / float(per_pixel), 1 / advance)

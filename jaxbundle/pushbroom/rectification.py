@@ -62,7 +62,7 @@ class MapNodes(NamedTuple):
     """Ground points at the nodes of a block: on the ellipsoid (Z = 0), and the vertical there."""
 
     X: Float[AnyArray, "3 n n"]
-    up: Float[AnyArray, "3 n n"]
+    vertical: Float[AnyArray, "3 n n"]
 
 
 class Places(NamedTuple):
@@ -77,10 +77,10 @@ def geographic_nodes(
 ) -> MapNodes:
     """Nodes at longitudes and latitudes, radians."""
     place = longitude, latitude, np.zeros_like(longitude)
-    return MapNodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
+    return MapNodes(*map(np.asarray, _ground_and_vertical(surface.earth, place)))
 
 
-_ground_and_up = compile_once(
+_ground_and_vertical = compile_once(
     lambda earth, place: (jnp.stack(earth_fixed(earth, place)), jnp.stack(vertical(place))), ()
 )
 
@@ -107,23 +107,25 @@ def block_places(
     heights = _heights(surface, nodes)
     if isinstance(image, RpcImage):
         project = lambda X: _project_by_rpc(image.rpc, surface, X)
-        exact = lambda: _rpc_places(image.rpc, surface, nodes, heights.height)
+        project_all = lambda: _rpc_places(image.rpc, surface, nodes, heights.height)
     else:
         starts = _find_starts(image, not_none(search), surface, nodes)
         if starts is None:
             return None
         scanner = scanner_of(image)
         project = lambda X: _project_near(scanner, search, X, starts)
-        exact = lambda: _scanner_places(image, not_none(search), nodes, heights.height, starts)
+        project_all = lambda: _scanner_places(
+            image, not_none(search), nodes, heights.height, starts
+        )
     places = _interpolated_places(image, project, nodes, heights, tolerance)
     if places is None:
         return None
-    line, pixel = places or exact()
+    line, pixel = places or project_all()
     if occlusion and isinstance(surface, Terrain):
         hidden = _hidden(image, search, surface, nodes, heights.height, (line, pixel))
         line = jnp.where(hidden, jnp.nan, line)
-    inside = _keep_inside(image, np.asarray(line), np.asarray(pixel))
-    return inside if np.isfinite(inside.line).any() else None
+    inside_places = _keep_inside(image, np.asarray(line), np.asarray(pixel))
+    return inside_places if np.isfinite(inside_places.line).any() else None
 
 
 class BlockHeights(NamedTuple):
@@ -131,7 +133,7 @@ class BlockHeights(NamedTuple):
 
     height: Float[AnyArray, "rows columns"]
     middle: Scalar
-    half: Scalar
+    half_range: Scalar
 
 
 # Positions [2, heights, n, n] of points [3, heights, n, n].
@@ -147,12 +149,12 @@ def _interpolated_places(
 ) -> tuple[AnyArray, AnyArray] | tuple[()] | None:
     """Interpolated positions; none if they are not within the tolerance; None if the block is
     beside the image."""
-    h = np.asarray(heights.middle) + HEIGHTS * np.asarray(heights.half)
+    h = np.asarray(heights.middle) + HEIGHTS * np.asarray(heights.half_range)
     # A terrain model without a height here.
     if not np.isfinite(h).all():
         return None
-    for node_step in (2, 1):
-        X, vertical = (a[:, None, ::node_step, ::node_step] for a in nodes)
+    for stride in (2, 1):
+        X, vertical = (a[:, None, ::stride, ::stride] for a in nodes)
         values = np.asarray(project(X + h[:, None, None] * vertical))
         if np.isfinite(values).all():
             if _is_beside(image, values):
@@ -185,8 +187,8 @@ def _fit_heights(
     """The coefficients a₀, a₁, a₂ at the nodes, and the largest error where they are tested."""
     low, lower, middle, upper, high = jnp.moveaxis(values, 1, 0)
     a = middle, (high - low) / 2, (high + low) / 2 - middle
-    value_at = lambda t: a[0] + t * (a[1] + t * a[2])
-    bend = jnp.maximum(jnp.abs(value_at(-0.5) - lower).max(), jnp.abs(value_at(0.5) - upper).max())
+    parabola = lambda t: a[0] + t * (a[1] + t * a[2])
+    bend = jnp.maximum(jnp.abs(parabola(-0.5) - lower).max(), jnp.abs(parabola(0.5) - upper).max())
     n = values.shape[-1]
     weights = hat_functions(n, 2)
     coarse = values[..., ::2, ::2].reshape(-1, n // 2 + 1, n // 2 + 1)
@@ -200,7 +202,7 @@ def _evaluate(
 ) -> tuple[Array, Array]:
     """Positions of all pixels at their heights."""
     n = coefficients.shape[-1]
-    t = (heights.height - heights.middle) / heights.half
+    t = (heights.height - heights.middle) / heights.half_range
     a0, a1, a2 = jnp.moveaxis(
         _interpolate_nodes(coefficients.reshape(6, n, n)).reshape(2, 3, BLOCK_SIZE, BLOCK_SIZE),
         1,
@@ -215,9 +217,9 @@ def _find_starts(
 ) -> Float[np.ndarray, "2 n n"] | None:
     """Positions of the nodes in a rigorous image; None if it sees none of them."""
     # Start values only: between the heights of terrain an image position moves by pixels.
-    raised = nodes.X + np.asarray(_level(surface)) * nodes.up
+    raised_nodes = nodes.X + np.asarray(_representative_height(surface)) * nodes.vertical
     # Nodes up to 512 lines and pixels outside have positions too, so that they enclose its edges.
-    projected = project_points(image, search, raised.reshape(3, -1), margin=2.0 * BLOCK_SIZE)
+    projected = project_points(image, search, raised_nodes.reshape(3, -1), margin=2.0 * BLOCK_SIZE)
     starts = np.stack([projected.line[0], projected.pixel[0]])
     if not np.isfinite(starts[0]).any():
         return None
@@ -232,7 +234,9 @@ def _scanner_places(
     starts: Float[np.ndarray, "2 n n"],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions of all pixels of a block in a rigorous image, each projected."""
-    line, pixel, ground = map(np.asarray, _places(scanner_of(image), search, nodes, height, starts))
+    line, pixel, ground = map(
+        np.asarray, _project_block(scanner_of(image), search, nodes, height, starts)
+    )
     is_lost = np.isnan(line) & np.isfinite(ground[0])
     if is_lost.any():
         # On a rough trajectory the interpolated start may not converge.
@@ -276,7 +280,7 @@ def _rpc_places(
     return project_to_rpc(rpc, surface, _ground(nodes, height))
 
 
-_project_by_rpc = compile_once(lambda *given: jnp.stack(project_to_rpc(*given)), ())
+_project_by_rpc = compile_once(lambda *arguments: jnp.stack(project_to_rpc(*arguments)), ())
 _are_occluded_in_rpc = compile_once(are_occluded_in_rpc, ())
 
 
@@ -288,8 +292,8 @@ def _project_near(
     starts: Float[AnyArray, "2 m m"],
 ) -> Float[Array, "2 heights n n"]:
     """Positions of points above nodes in a rigorous image, from those of the nodes."""
-    node_step = (starts.shape[-1] - 1) // (X.shape[-1] - 1)
-    start = jnp.broadcast_to(starts[:, None, ::node_step, ::node_step], (2, *X.shape[1:]))
+    stride = (starts.shape[-1] - 1) // (X.shape[-1] - 1)
+    start = jnp.broadcast_to(starts[:, None, ::stride, ::stride], (2, *X.shape[1:]))
     return jnp.stack(project_from(image, search, tuple(X), *start))
 
 
@@ -299,9 +303,9 @@ def _search(
     """Lines and pixels of points [3, n] by a search of the image, in batches of points."""
     places = np.empty((2, X.shape[1]))
     for k in range(0, X.shape[1], portion):
-        portion_of_points = X[:, k : k + portion]
-        n = portion_of_points.shape[1]
-        padded = np.pad(portion_of_points, ((0, 0), (0, portion - n)), mode="edge")
+        batch = X[:, k : k + portion]
+        n = batch.shape[1]
+        padded = np.pad(batch, ((0, 0), (0, portion - n)), mode="edge")
         # Of one shape, so that one program serves any number of points.
         projected = project_points(image, search, padded, margin=0.0)
         places[:, k : k + n] = np.asarray(projected.line)[0, :n], np.asarray(projected.pixel)[0, :n]
@@ -389,7 +393,7 @@ def _fill_unseen_nodes(starts: Float[np.ndarray, "2 n n"]) -> Float[np.ndarray, 
     return np.where(is_seen, starts, (A @ plane).T.reshape(starts.shape))
 
 
-def _level(surface: GroundSurface) -> Scalar:
+def _representative_height(surface: GroundSurface) -> Scalar:
     """A representative height of the surface."""
     if isinstance(surface, Terrain):
         return (surface.lowest + surface.highest) / 2
@@ -397,7 +401,7 @@ def _level(surface: GroundSurface) -> Scalar:
 
 
 @partial(compile_once, static=())
-def _places(
+def _project_block(
     image: ScannerGeometry,
     search: Search,
     nodes: MapNodes,
@@ -426,12 +430,12 @@ def _heights_of(surface: GroundSurface, nodes: MapNodes) -> Float[Array, "rows c
     if isinstance(surface, Terrain):
         x, y, _ = surface.grid(tuple(nodes.X))
         return jnp.asarray(bilinear(surface.heights, *_interpolate_nodes(jnp.stack([x, y]))))
-    return jnp.broadcast_to(_level(surface), (BLOCK_SIZE, BLOCK_SIZE)) * 1.0
+    return jnp.broadcast_to(_representative_height(surface), (BLOCK_SIZE, BLOCK_SIZE)) * 1.0
 
 
 def _ground(nodes: MapNodes, height: Float[AnyArray, "rows columns"]) -> Float[Array, "3 r c"]:
     """The points of all pixels, [3, BLOCK_SIZE, BLOCK_SIZE]."""
-    return _interpolate_nodes(nodes.X) + height * _interpolate_nodes(nodes.up)
+    return _interpolate_nodes(nodes.X) + height * _interpolate_nodes(nodes.vertical)
 
 
 _raise = compile_once(_ground, ())

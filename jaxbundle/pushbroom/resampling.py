@@ -74,23 +74,26 @@ def _convolve(
     row: Float[AnyArray, "*shape"],
     column: Float[AnyArray, "*shape"],
     weights: Callable[[Scalar], tuple[Scalar, ...]],
-    pixels_before: int,
+    lead: int,
 ) -> Array:
-    """Products of one-dimensional weights of the pixels starting `pixels_before` the position."""
+    """Products of one-dimensional weights of the pixels from `lead` before the position."""
     rows, columns, bands = pixels.shape
     working = working_type(pixels.dtype)
     i, j = jnp.floor(row), jnp.floor(column)
     weights_of = lambda place: [jnp.asarray(w)[..., None] for w in weights(place.astype(working))]
-    weights_down, right = weights_of(jnp.asarray(row - i)), weights_of(jnp.asarray(column - j))
-    # The index of a position that is NaN must be valid; its weights keep the value NaN.
-    i, j = (jnp.nan_to_num(v).astype(jnp.int32) - pixels_before for v in (i, j))
-    flat = pixels.reshape(-1, bands)
-    lines = [jnp.clip(i + k, 0, rows - 1) * columns for k in range(len(weights_down))]
-    places = [jnp.clip(j + k, 0, columns - 1) for k in range(len(right))]
-    sum_of_line = lambda line: sum(
-        w * flat[line + place].astype(working) for w, place in zip(right, places)
+    row_weights, column_weights = (
+        weights_of(jnp.asarray(row - i)),
+        weights_of(jnp.asarray(column - j)),
     )
-    return jnp.asarray(sum(w * sum_of_line(line) for w, line in zip(weights_down, lines)))
+    # The index of a position that is NaN must be valid; its weights keep the value NaN.
+    i, j = (jnp.nan_to_num(v).astype(jnp.int32) - lead for v in (i, j))
+    flat = pixels.reshape(-1, bands)
+    lines = [jnp.clip(i + k, 0, rows - 1) * columns for k in range(len(row_weights))]
+    places = [jnp.clip(j + k, 0, columns - 1) for k in range(len(column_weights))]
+    sum_of_row = lambda line: sum(
+        w * flat[line + place].astype(working) for w, place in zip(column_weights, places)
+    )
+    return jnp.asarray(sum(w * sum_of_row(line) for w, line in zip(row_weights, lines)))
 
 
 def _cubic_weights(x: Scalar) -> tuple[Scalar, ...]:

@@ -80,8 +80,7 @@ def _walk(elapsed: Times, sigma: float, step: float, rng: np.random.Generator) -
     if not steps_after + steps_before <= 1e6:
         raise InputError(
             f"signal 'walk': step is {step:g} s, {steps_after + steps_before:.3g} in the time of "
-            "the image; "
-            "give a longer one"
+            "the image; give a longer one"
         )
     steps_after, steps_before = int(steps_after), int(steps_before)
     forward, backward = (

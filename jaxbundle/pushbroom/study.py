@@ -114,7 +114,7 @@ class AccuracyTable(TableMethods):
             for cell in self.erring
         ]
         names = ["trajectory", "sigma", "interpolation", "rms", "ce90"]
-        names += [f"{method}_{value}" for method in WAYS[1:] for value in names[3:5]]
+        names += [f"{way}_{value}" for way in WAYS[1:] for value in names[3:5]]
         return {name: np.array(column) for name, column in zip(names, zip(*rows))}
 
     def to_dict(self) -> dict[str, Any]:
@@ -123,14 +123,14 @@ class AccuracyTable(TableMethods):
 
     def __str__(self) -> str:
         """Trajectories across, accuracies down."""
-        kind_in_words = {
+        description = {
             "bias": "one error per image",
             "white": "an error in every record of the table",
         }
         view = _degrees(self.field_of_view)
         text = [
             f"altitude {self.altitude / 1e3:.1f} km, field of view {view:g}°",
-            f"error of attitude about each axis: {kind_in_words[self.kind]}; {self.draws} draws",
+            f"error of attitude about each axis: {description[self.kind]}; {self.draws} draws",
         ]
         line = lambda name, values, form: f"{name:22}" + "".join(f"{v:>10{form}}" for v in values)
         for value in ("rms", "ce90"):
@@ -139,11 +139,9 @@ class AccuracyTable(TableMethods):
                 cells = [getattr(c, value) for c in self.error_free if c.interpolation == method]
                 text.append(line(f"no error, {method}", cells, ".4f"))
             for sigma in dict.fromkeys(cell.sigma for cell in self.erring):
-                for row_name in WAYS:
-                    cells = [
-                        getattr(c, f"{row_name}_{value}") for c in self.erring if c.sigma == sigma
-                    ]
-                    text.append(line(f"{_degrees(sigma):g}°, {row_name}", cells, ".2f"))
+                for way in WAYS:
+                    cells = [getattr(c, f"{way}_{value}") for c in self.erring if c.sigma == sigma]
+                    text.append(line(f"{_degrees(sigma):g}°, {way}", cells, ".2f"))
         return "\n".join(text)
 
 
@@ -172,32 +170,34 @@ def accuracy_table(
     size = flight.lines, flight.pixels
     line, pixel = (v.ravel() for v in spread_positions(*size, (lines, pixels), 1))
     all_lines, all_pixels = (v.ravel() for v in spread_positions(*size))
-    quiet = dataclasses.replace(flight, noise=Noise())
-    altitude, view = altitude_and_view(true_image(quiet), surface)
+    noiseless_flight = dataclasses.replace(flight, noise=Noise())
+    altitude, view = altitude_and_view(true_image(noiseless_flight), surface)
     error_free, erring = [], []
     for name, axes in TRAJECTORIES.items():
         angles = {axis: flight.angles[axis] for axis in axes if axis in flight.angles}
-        varied = dataclasses.replace(quiet, angles=angles)
-        truth = true_image(varied)
+        varied_flight = dataclasses.replace(noiseless_flight, angles=angles)
+        truth = true_image(varied_flight)
         # Without noise only the interpolation of the samples errs.
         for method in FLOORS:
-            image = measured_image(dataclasses.replace(varied, attitude_interpolation=method))
+            image = measured_image(
+                dataclasses.replace(varied_flight, attitude_interpolation=method)
+            )
             errors = ground_errors(image, truth, surface, all_lines, all_pixels)
             length = np.linalg.norm(errors, axis=1)
             # Where a ray meets the surface, as of `GroundAccuracy`.
-            known_lengths = length[np.isfinite(length)]
+            finite_length = length[np.isfinite(length)]
             rms, ce90 = np.nan, np.nan
-            if len(known_lengths):
+            if len(finite_length):
                 rms, ce90 = (
-                    float(np.sqrt(np.mean(known_lengths**2))),
-                    float(np.quantile(known_lengths, 0.9)),
+                    float(np.sqrt(np.mean(finite_length**2))),
+                    float(np.quantile(finite_length, 0.9)),
                 )
             error_free.append(ErrorFree(name, method, rms, ce90))
-        image = measured_image(varied)
+        image = measured_image(varied_flight)
         for sigma in sigmas:
             noise = Noise(**{f"attitude_{kind}": sigma})
-            counted = simulate_accuracy(image, surface, line, pixel, noise, draws, seed)
-            exact = propagate_accuracy(image, surface, line, pixel, noise)
+            simulated = simulate_accuracy(image, surface, line, pixel, noise, draws, seed)
+            propagated = propagate_accuracy(image, surface, line, pixel, noise)
             level = closed_form(altitude, view, sigma, sigma, sigma)
             # Above a plane, near the nadir, errors along and across are almost alike.
             round_ = circular_error(np.eye(2) * level**2 / 2)
@@ -205,11 +205,11 @@ def accuracy_table(
                 Erring(
                     name,
                     float(sigma),
-                    counted.overall,
-                    exact.overall,
+                    simulated.overall,
+                    propagated.overall,
                     level,
-                    counted.overall_ce90,
-                    exact.overall_ce90,
+                    simulated.overall_ce90,
+                    propagated.overall_ce90,
                     round_,
                 )
             )
@@ -224,10 +224,10 @@ def altitude_and_view(image: PushbroomImage, surface: GroundSurface) -> tuple[fl
     )[:, 0]
     heights = [float(surface.height(tuple(X))) for X in (P, ground)]
     edges = np.array([-0.5, image.pixels - 0.5])
-    left_edge, right_edge = (
+    left_ray, right_ray = (
         np.append(slope, -1.0) for slope in np.stack(_slopes(image.optics, edges), 1)
     )
-    cosine = left_edge @ right_edge / (np.linalg.norm(left_edge) * np.linalg.norm(right_edge))
+    cosine = left_ray @ right_ray / (np.linalg.norm(left_ray) * np.linalg.norm(right_ray))
     return heights[0] - heights[1], float(np.arccos(cosine))
 
 

@@ -66,14 +66,14 @@ class Terrain(GroundSurface):
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
         start = o, d
-        constant, o, d = stop_gradient((self, o, d))
-        top, bottom = constant._slab(o, d)
-        path = constant._path(o, d, top, bottom)
-        tau = _first_hit(path, constant.heights, self.over_voids)
+        fixed, o, d = stop_gradient((self, o, d))
+        top, bottom = fixed._slab(o, d)
+        path = fixed._path(o, d, top, bottom)
+        tau = _first_hit(path, fixed.heights, self.over_voids)
         s = top + tau * (bottom - top)
-        slope = _rate(path, tau, constant.heights) / (bottom - top)
+        slope = _rate(path, tau, fixed.heights) / (bottom - top)
         # Newton's step on the exact coordinates; derivatives go around the traversal
-        s = s - _above_ground(s, None, (constant, o, d)) / slope
+        s = s - _above_ground(s, None, (fixed, o, d)) / slope
         return implicit_root(_above_ground, solve_dense, s, None, (self, *start))
 
     def grid(self, X: Vector) -> Triple:
@@ -200,7 +200,7 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
     speed = jnp.abs(px[1]) + jnp.abs(py[1])
     # A billionth of a cell: at a border, where rounding may leave the ray in the old cell, the
     # traversal still advances.
-    smallest_step = 1e-9 / jnp.maximum(speed, 1.0)
+    min_advance = 1e-9 / jnp.maximum(speed, 1.0)
 
     def border(p: Parabola, tau: Scalar) -> Scalar:
         """Where the coordinate reaches the next line of the grid."""
@@ -211,41 +211,45 @@ def _first_hit(path: Path, heights: Float[AnyArray, "rows columns"], over_voids:
 
     def step(state: TraversalState) -> TraversalState:
         tau, hit, void, _ = state
-        leaves = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + smallest_step, 1.0)
-        middle = (tau + leaves) / 2
+        exit_tau = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + min_advance, 1.0)
+        middle = (tau + exit_tau) / 2
         x, y = value(px, middle), value(py, middle)
         cell = cell_at(heights, jnp.floor(x), jnp.floor(y))
         f = [
             value(ph, t) - height_in_cell(cell, value(px, t), value(py, t))
-            for t in (tau, middle, leaves)
+            for t in (tau, middle, exit_tau)
         ]
         part = _first_root(*f)
         # Below the terrain where heights begin again: it was met in the void.
-        is_under = void & (f[0] < 0)
+        is_below = void & (f[0] < 0)
         # A corner without height makes all of the cell NaN, so that the middle decides.
         void = jnp.isnan(f[1])
-        is_found = (part <= 1) & ~is_under
+        is_hit = (part <= 1) & ~is_below
         is_done = (
-            is_found | is_under | (leaves >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)
+            is_hit
+            | is_below
+            | (exit_tau >= 1)
+            | _has_left_grid(px, x, columns)
+            | _has_left_grid(py, y, rows)
         )
         if not over_voids:
             is_done = is_done | void
-        return leaves, jnp.where(is_found, tau + part * (leaves - tau), jnp.nan), void, is_done
+        return exit_tau, jnp.where(is_hit, tau + part * (exit_tau - tau), jnp.nan), void, is_done
 
-    start = jnp.maximum(_entry(px, columns), _entry(py, rows))
-    is_lost = jnp.isnan(speed) | ~(start < 1)
+    start = jnp.maximum(_entry_tau(px, columns), _entry_tau(py, rows))
+    is_beside = jnp.isnan(speed) | ~(start < 1)
     if not over_voids:
-        is_lost = is_lost | (start > 0)
-    state = start, jnp.full_like(speed, jnp.nan), start > 0, is_lost
+        is_beside = is_beside | (start > 0)
+    state = start, jnp.full_like(speed, jnp.nan), start > 0, is_beside
     return jax.lax.while_loop(lambda s: ~s[3], step, state)[1]
 
 
-def _leaves(p: Parabola, x: Scalar, size: int) -> Bool[Array, ""]:
+def _has_left_grid(p: Parabola, x: Scalar, size: int) -> Bool[Array, ""]:
     """Whether a coordinate is off the grid and does not come back."""
     return jnp.where(p[1] > 0, x > size - 1, x < 0)
 
 
-def _entry(p: Parabola, size: int) -> Scalar:
+def _entry_tau(p: Parabola, size: int) -> Scalar:
     """τ where a coordinate comes to the grid, 0 if it is there at first, ∞ if it never is."""
     target = jnp.where(p[0] < 0, 0.0, size - 1.0)
     tau = jnp.zeros_like(p[0])
@@ -265,8 +269,8 @@ def _first_root(f0: Scalar, fm: Scalar, f1: Scalar) -> Scalar:
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
     # Of the two forms of a root the one without cancellation (Press et al., 2007, section 5.6).
     q = -(b + jnp.where(b < 0, -root, root)) / 2
-    root_a = q / jnp.where(a == 0, jnp.nan, a)
-    root_b = f0 / jnp.where(q == 0, jnp.nan, q)
+    root1 = q / jnp.where(a == 0, jnp.nan, a)
+    root2 = f0 / jnp.where(q == 0, jnp.nan, q)
     within = lambda w: jnp.where((w >= 0) & (w <= 1), w, jnp.inf)
-    smallest_root = jnp.minimum(within(root_a), within(root_b))
-    return jnp.where(discriminant < 0, jnp.inf, smallest_root)
+    smallest = jnp.minimum(within(root1), within(root2))
+    return jnp.where(discriminant < 0, jnp.inf, smallest)

@@ -107,11 +107,11 @@ def matrix_from_pitch_roll_yaw(angles: Float[AnyArray, "3"]) -> Float[Array, "3 
 
 def orbital_frame(P: Float[AnyArray, "3"], V: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """The axes right, forward and up at P, of a platform that moves with V, as columns."""
-    vertical = P / jnp.linalg.norm(P)
+    up = P / jnp.linalg.norm(P)
     # V is not quite horizontal: right and forward are perpendicular to the vertical
-    right = jnp.cross(V, vertical)
+    right = jnp.cross(V, up)
     right = right / jnp.linalg.norm(right)
-    return jnp.stack([right, jnp.cross(vertical, right), vertical], axis=1)
+    return jnp.stack([right, jnp.cross(up, right), up], axis=1)
 
 
 def _slerp(table: TimeTable, t: Scalar) -> Float[Array, "4"]:

@@ -57,7 +57,7 @@ def _given_bases(adjustment: "Adjustment", rigs: Rigs) -> list[tuple[int, int]]:
     """The rows of the two mountings of every base with a given length."""
     network, table = adjustment.problem.network, adjustment.problem.table(MOUNTING)
     row = {table.label(k): k for k in range(table.rows)}
-    mountings, bases = rigs.given(network)
+    mountings, bases = rigs.read_settings(network)
     rows_of_bases = []
     for rig, mounted in rigs.mounted(network).items():
         reference = f"{network.cameras[mounted.reference].id} of {rig}"

@@ -25,7 +25,7 @@ from jaxbundle.network.tables import Source
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.files import SIGMAS, make_cloud, read_cloud_csv, write_cloud_csv
 from jaxbundle.surfaces.las_header import EXPECTED, check_las
-from jaxbundle.system.file_content import missing, read_content
+from jaxbundle.system.file_content import no_such_file, read_content
 from jaxbundle.system.foreign_parsers import foreign_parser
 
 COLOURS = ("red", "green", "blue")
@@ -69,7 +69,7 @@ def read_cloud(path: str | Path) -> Cloud:
     **Raises:** `InputError` if it cannot be read."""
     path = Path(path)
     if not path.is_file():
-        raise missing(path, "a cloud, .csv, .ply, .las or .laz")
+        raise no_such_file(path, "a cloud, .csv, .ply, .las or .laz")
     readers = {".csv": read_cloud_csv, ".txt": read_cloud_csv, ".xyz": read_cloud_csv,
                ".ply": _read_ply, ".las": _read_las, ".laz": _read_las}  # fmt: skip
     suffix = path.suffix.lower()
@@ -154,7 +154,7 @@ def _ply_numbers(
         table = table.reshape(number, len(names))
     except ValueError:  # which point? the slow way
         rows = [TextRow(path, k, line) for k, line in enumerate(lines, first_line)]
-        table = np.array([row.numbers(names, more=True) for row in rows])
+        table = np.array([row.numbers(names, allow_more=True) for row in rows])
     return dict(zip(names, table.T))
 
 

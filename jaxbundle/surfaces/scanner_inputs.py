@@ -49,7 +49,7 @@ from jaxbundle.surfaces.scanner_views import (
     neighbourhood,
 )
 from jaxbundle.surfaces.views import Grey
-from jaxbundle.system.file_content import missing
+from jaxbundle.system.file_content import no_such_file
 from jaxbundle.system.rasters import check_pixels, check_raw, open_raster, read_pixels
 
 if TYPE_CHECKING:
@@ -357,7 +357,7 @@ def _orientation(
 ) -> tuple[Orientation, Path]:
     """The polynomials, or the scanner's image and Earth; and the raster, if it is not known."""
     if not path.is_file():
-        raise missing(path, "a raster with RPC, or a scanner file")
+        raise no_such_file(path, "a raster with RPC, or a scanner file")
     if path.suffix.lower() in IMAGES:
         return read_rpc(find_coefficients(path)), path
     scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (path.suffix == ".toml")

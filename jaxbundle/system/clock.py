@@ -16,15 +16,14 @@ def now() -> datetime.datetime:
     1970) in UTC.
 
     **Raises:** `InputError` for a variable that is no time."""
-    seconds_given = os.environ.get(VARIABLE, "")
-    if not seconds_given:
+    seconds = os.environ.get(VARIABLE, "")
+    if not seconds:
         return datetime.datetime.now().astimezone()
     try:
-        return datetime.datetime.fromtimestamp(int(seconds_given), datetime.UTC)
+        return datetime.datetime.fromtimestamp(int(seconds), datetime.UTC)
     except (ValueError, OverflowError, OSError):
         raise InputError(
-            f"{VARIABLE}: expected seconds since 1970, got {seconds_given[:30]!r}; correct or "
-            "unset the "
+            f"{VARIABLE}: expected seconds since 1970, got {seconds[:30]!r}; correct or unset the "
             "environment variable"
         ) from None
 

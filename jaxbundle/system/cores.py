@@ -25,8 +25,8 @@ def can_run_two_programs() -> bool:
     """Whether XLA's pool has a thread left while two programs wait in it."""
     if jaxlib_version() >= (0, 11):
         return True  # they do not wait there
-    threads_given = os.environ.get(THREADS, "")
-    return (int(threads_given) if threads_given.isdecimal() else available_cores()) > 2
+    threads = os.environ.get(THREADS, "")
+    return (int(threads) if threads.isdecimal() else available_cores()) > 2
 
 
 def use_cores(number: int | None = None) -> None:

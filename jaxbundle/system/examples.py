@@ -49,28 +49,31 @@ def write_example(name: str, folder: str | Path) -> None:
         raise InputError(f"no example {name!r}: expected one of {', '.join(EXAMPLES)}")
     target = Path(os.path.abspath(folder))
     if os.path.lexists(target) and not (target.is_dir() and not any(target.iterdir())):
-        why = "is not empty" if target.is_dir() else "is no folder"
-        raise InputError(f"{folder}: {why}; give a new folder")
+        reason = "is not empty" if target.is_dir() else "is no folder"
+        raise InputError(f"{folder}: {reason}; give a new folder")
     if not target.parent.is_dir():
         raise InputError(f"{folder}: there is no folder {target.parent}")
     try:
-        with as_file(_source(name)) as source, temporary(f"{target}.{os.getpid()}.new") as new:
+        with (
+            as_file(_example_files(name)) as source,
+            temporary(f"{target}.{os.getpid()}.new") as new,
+        ):
             shutil.copytree(source, new)
             os.replace(new, target)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {_why(error)}") from None
+        raise InputError(f"{folder}: cannot be written: {_reason_of(error)}") from None
 
 
-def _why(error: OSError) -> str:
+def _reason_of(error: OSError) -> str:
     """The reason of the system; `copytree` lists one for each file: source, copy, reason."""
     if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
         return re.sub(r"^\[Errno \d+\] |: '.*", "", str(error.args[0][0][-1]))
     return error.strerror or str(error)
 
 
-def _source(name: str) -> Traversable:
+def _example_files(name: str) -> Traversable:
     """The files of an example, in the package or the source tree."""
-    for place in (files("jaxbundle") / "examples", Path(__file__).parents[2] / "examples"):
-        if (place / name).is_dir():
-            return place / name
+    for folder in (files("jaxbundle") / "examples", Path(__file__).parents[2] / "examples"):
+        if (folder / name).is_dir():
+            return folder / name
     raise InputError(f"the files of example {name!r} are missing from this installation")

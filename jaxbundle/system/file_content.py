@@ -38,12 +38,12 @@ def check_plain(path: str | Path) -> None:
     path = Path(path)
     try:
         mode = os.stat(path).st_mode
-        real = os.path.realpath(path)
+        real_path = os.path.realpath(path)
     except (OSError, ValueError):
         return  # reported when it is opened
-    is_given_pipe = path.parent in DESCRIPTORS and stat.S_ISFIFO(mode)
-    system = stat.S_ISREG(mode) and real.startswith(SYSTEM)
-    if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or is_given_pipe):
+    is_open_pipe = path.parent in DESCRIPTORS and stat.S_ISFIFO(mode)
+    system = stat.S_ISREG(mode) and real_path.startswith(SYSTEM)
+    if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or is_open_pipe):
         raise InputError(f"{path}: a file of the system, a device or a pipe; give a plain file")
 
 
@@ -68,7 +68,7 @@ def is_plain(path: str | Path) -> bool:
     return os.path.isfile(path)
 
 
-def missing(path: str | Path, expected: str = "a file") -> InputError:
+def no_such_file(path: str | Path, expected: str = "a file") -> InputError:
     """That no file has this name, or that it is a folder."""
     if os.path.isdir(path):
         return InputError(f"{path}: is a folder; expected {expected}")
@@ -134,23 +134,23 @@ def parse_json(path: str | Path, text: str) -> Any:
 def _parse(path: str | Path, text: str, parse: Callable[[str], Any], kind: str) -> Any:
     try:
         document = parse(text)
-        wrong = _beyond(document)
+        problem = _describe_violations(document)
     except RecursionError:
-        wrong = "nested too deeply"
+        problem = "nested too deeply"
     except ValueError as error:
-        wrong = f"{error}"
+        problem = f"{error}"
         if isinstance(error, json.JSONDecodeError) and error.pos >= len(text.rstrip()):
-            wrong += ENDS_EARLY
-        if "digits" not in wrong:  # Python reads no whole number of more than 4300
-            raise InputError(f"{path}: not valid {kind}: {wrong}") from None
-        wrong = TOO_LARGE
-    if wrong:
-        line = _line_beyond(text)
-        raise InputError(f"{path}{line and f', line {line}'}: not valid {kind}: {wrong}")
+            problem += ENDS_EARLY
+        if "digits" not in problem:  # Python reads no whole number of more than 4300
+            raise InputError(f"{path}: not valid {kind}: {problem}") from None
+        problem = TOO_LARGE
+    if problem:
+        line = _violating_line(text)
+        raise InputError(f"{path}{line and f', line {line}'}: not valid {kind}: {problem}")
     return document
 
 
-def _beyond(document: Any) -> str:
+def _describe_violations(document: Any) -> str:
     """Violations of the limits in a document, in words; empty if there are none."""
     level = [document]
     for _ in range(DEEPEST_NESTING):
@@ -167,14 +167,14 @@ def _beyond(document: Any) -> str:
     return f"nested too deeply: more than {DEEPEST_NESTING} levels"
 
 
-def _line_beyond(text: str) -> int | str:
+def _violating_line(text: str) -> int | str:
     """The first line with too long a number, too many dots in a key, or too many open brackets."""
     depth = 0
     for number, line in enumerate(text.split("\n"), 1):
-        bare = QUOTED.sub("s", line).partition("#")[0]
-        if DIGITS.search(bare) or DOTTED.search(bare):
+        unquoted = QUOTED.sub("s", line).partition("#")[0]
+        if DIGITS.search(unquoted) or DOTTED.search(unquoted):
             return number
-        for bracket in re.findall(r"[][{}]", bare):
+        for bracket in re.findall(r"[][{}]", unquoted):
             depth += 1 if bracket in "[{" else -1
             if depth > DEEPEST_NESTING:
                 return number

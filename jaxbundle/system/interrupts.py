@@ -84,14 +84,14 @@ def _open_channel() -> "tuple[Callable[[], bytes], int]":
         return lambda: os.read(reader, 1), writer
     import socket
 
-    our_end, their_end = socket.socketpair()
-    their_end.setblocking(False)
-    _kept.append(their_end)
-    return lambda: our_end.recv(1), their_end.fileno()
+    reader_socket, writer_socket = socket.socketpair()
+    writer_socket.setblocking(False)
+    _open_sockets.append(writer_socket)
+    return lambda: reader_socket.recv(1), writer_socket.fileno()
 
 
 # Sockets that must stay open as long as the process.
-_kept: list[object] = []
+_open_sockets: list[object] = []
 
 
 def advise(words: str) -> None:
@@ -122,9 +122,9 @@ def _watch(read_byte: "Callable[[], bytes]") -> None:
         number = read_byte()[0]
     time.sleep(GRACE)
     # The disk does not answer.
-    last_resort = threading.Timer(2 * LONGEST_DEFERRAL, _say_and_exit, (number,))
-    last_resort.daemon = True
-    last_resort.start()
+    timer = threading.Timer(2 * LONGEST_DEFERRAL, _say_and_exit, (number,))
+    timer.daemon = True
+    timer.start()
     _end(number)
 
 

@@ -50,10 +50,10 @@ def join_processes(
             initialization_timeout=wait_seconds,
         )
     except (ValueError, TypeError, RuntimeError) as error:
-        why = " ".join(str(error).split())[:300]
+        reason = " ".join(str(error).split())[:300]
         if address is None and not any(name.startswith("SLURM_") for name in os.environ):
-            why = "no SLURM variables were found"
-        raise InputError(f"the processes cannot be joined: {why}; {HOW_TO_JOIN}") from None
+            reason = "no SLURM variables were found"
+        raise InputError(f"the processes cannot be joined: {reason}; {HOW_TO_JOIN}") from None
     return jax.process_index() == 0
 
 
@@ -99,8 +99,8 @@ def _check_address(host: str, port: int, process: int | None, wait_seconds: int)
         try:
             socket.create_server(("", port)).close()
         except OSError as error:
-            why = os.strerror(error.errno or 0)
-            raise InputError(f"port {port}: {why}; take another") from None
+            reason = os.strerror(error.errno or 0)
+            raise InputError(f"port {port}: {reason}; take another") from None
         return
     end = time.monotonic() + wait_seconds
     while process:

@@ -58,11 +58,14 @@ def _remove_damaged_programs(folder: Path) -> None:
 
     JAX compiles them again, in every process, since it does not replace a file. A damaged one is
     left by a full disk; one that is just being written by another process is not touched."""
-    show, about = warnings.showwarning, "Error (reading|writing) persistent compilation cache entry"
+    show_warning, pattern = (
+        warnings.showwarning,
+        "Error (reading|writing) persistent compilation cache entry",
+    )
 
     def handle(message: Warning | str, *where: Any, **options: Any) -> None:
-        if not re.match(about, str(message)):
-            return show(message, *where, **options)
+        if not re.match(pattern, str(message)):
+            return show_warning(message, *where, **options)
         # Within a minute another process has written the file of a program, some megabytes.
         name, latest = re.search(r"'(\w+)", str(message)), time.time() - 60.0
         for file in folder.glob(f"{name[1]}-*-cache") if name else ():
@@ -71,5 +74,5 @@ def _remove_damaged_programs(folder: Path) -> None:
                     file.unlink()
 
     # "always": as an error, by -W error, it would end the computation.
-    warnings.filterwarnings("always", about)
+    warnings.filterwarnings("always", pattern)
     warnings.showwarning = handle

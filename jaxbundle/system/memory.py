@@ -30,7 +30,7 @@ def free_memory() -> float:
     """Bytes that this process may still take: the least of what the machine has available, and of
     what is left of the limits of its control groups (containers) and of its address space (`ulimit
     -v`). Infinite where the system does not say."""
-    return max(0.0, min(_of_the_machine(), _of_the_address_space(), left_in_control_groups()))
+    return max(0.0, min(_available_memory(), _address_space_left(), left_in_control_groups()))
 
 
 def require_address_space(command: str = "") -> None:
@@ -38,12 +38,12 @@ def require_address_space(command: str = "") -> None:
     error that can be caught.
 
     **Raises:** `MemoryError`."""
-    bytes_left = _of_the_address_space()
+    remaining = _address_space_left()
     needed = SMALLEST_ADDRESS_SPACE.get(command, SMALLEST_ADDRESS_SPACE[""])
-    if bytes_left < needed:
+    if remaining < needed:
         raise MemoryError(
             f"not enough memory: the limit of the address space (ulimit -v) leaves "
-            f"{bytes_left / 1e9:.2f} GB; at least {needed / 1e9:.2f} GB are needed: raise it"
+            f"{remaining / 1e9:.2f} GB; at least {needed / 1e9:.2f} GB are needed: raise it"
         )
 
 
@@ -60,8 +60,8 @@ def is_memory_shortage(error: BaseException) -> bool:
 def left_in_control_groups(root: str | Path = "/") -> float:
     """Bytes left in the control groups of this process, of version 1 or 2, below a root folder:
     limit − usage, without cached files, which the system drops when others need the memory."""
-    bytes_left = math.inf
-    for line in _read(Path(root, "proc/self/cgroup")).splitlines():
+    remaining = math.inf
+    for line in _read_text(Path(root, "proc/self/cgroup")).splitlines():
         _, controllers, group = (*line.split(":", 2), "", "")[:3]
         # Version 2 has one line, "0::/group"; version 1 one for each controller.
         if controllers and "memory" not in controllers.split(","):
@@ -71,12 +71,12 @@ def left_in_control_groups(root: str | Path = "/") -> float:
         if not controllers:
             names = ("memory.max", "memory.current", "inactive_file")
         # A container may see its own group as the root of the mounted tree.
-        own_folder = mounted / group.lstrip("/")
+        group_folder = mounted / group.lstrip("/")
         # The limit of every enclosing group applies, too: the least of them counts.
-        for folder in dict.fromkeys((own_folder, *own_folder.parents, mounted)):
+        for folder in dict.fromkeys((group_folder, *group_folder.parents, mounted)):
             if folder == mounted or mounted in folder.parents:
-                bytes_left = min(bytes_left, _left_in(folder, *names))
-    return bytes_left
+                remaining = min(remaining, _group_memory_left(folder, *names))
+    return remaining
 
 
 def return_freed_memory() -> None:
@@ -89,20 +89,22 @@ def return_freed_memory() -> None:
             trim(0)
 
 
-def _left_in(folder: Path, limit: str, usage: str, cached: str) -> float:
-    limit_words, used_words = (_read(folder / name).strip() for name in (limit, usage))
-    if not (limit_words.isdecimal() and used_words.isdecimal()) or int(limit_words) >= NO_LIMIT:
+def _group_memory_left(folder: Path, limit: str, usage: str, cached: str) -> float:
+    limit_text, usage_text = (_read_text(folder / name).strip() for name in (limit, usage))
+    if not (limit_text.isdecimal() and usage_text.isdecimal()) or int(limit_text) >= NO_LIMIT:
         return math.inf
     # Cached files are counted as used, and are given up when memory is asked for.
-    return int(limit_words) - int(used_words) + _field(_read(folder / "memory.stat"), cached, 0.0)
+    return (
+        int(limit_text) - int(usage_text) + _field(_read_text(folder / "memory.stat"), cached, 0.0)
+    )
 
 
-def _of_the_machine() -> float:
+def _available_memory() -> float:
     """Bytes that are available: Linux and Windows say it; of other systems half of the memory is
     taken, what a machine at work has free, and infinity where not even that is known."""
     if sys.platform == "win32":
         return _available_on_windows()
-    if text := _read(Path("/proc/meminfo")):
+    if text := _read_text(Path("/proc/meminfo")):
         return 1024 * _field(text, "MemAvailable:", math.inf)
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2
@@ -130,13 +132,13 @@ def _available_on_windows() -> float:
     return float(status.available)
 
 
-def _of_the_address_space() -> float:
+def _address_space_left() -> float:
     try:
         import resource
     except ImportError:  # Windows
         return math.inf
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    pages = _read(Path("/proc/self/statm")).split()
+    pages = _read_text(Path("/proc/self/statm")).split()
     if limit == resource.RLIM_INFINITY or not pages:
         return math.inf
     return limit - int(pages[0]) * os.sysconf("SC_PAGE_SIZE")
@@ -150,7 +152,7 @@ def _field(text: str, name: str, otherwise: float) -> float:
     return otherwise
 
 
-def _read(path: Path) -> str:
+def _read_text(path: Path) -> str:
     with suppress(OSError):
         return path.read_text()
     return ""

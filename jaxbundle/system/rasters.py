@@ -123,8 +123,8 @@ def read_heights(path: str | Path) -> HeightRaster:
     **Raises:** `InputError` if it cannot be read, has no georeference, or is rotated."""
     with open_raster(path) as source:
         check_georeference(path, source)
-        place = source.transform
-        if place.b or place.d:
+        transform = source.transform
+        if transform.b or transform.d:
             raise InputError(
                 f"{path}: the raster is rotated; expected rows along X, columns along Y (gdalwarp)"
             )
@@ -133,8 +133,8 @@ def read_heights(path: str | Path) -> HeightRaster:
         return HeightRaster(
             values,
             # Heights are of the centres of cells.
-            (place.c + 0.5 * place.a, place.f + 0.5 * place.e),
-            (place.a, place.e),
+            (transform.c + 0.5 * transform.a, transform.f + 0.5 * transform.e),
+            (transform.a, transform.e),
             None if crs is None else crs.to_wkt(),
             crs is not None and crs.is_geographic,
         )
@@ -163,14 +163,20 @@ def check_pixels(
     the file: the densest packing of DEFLATE is 1032.
 
     **Raises:** `InputError`."""
-    (top, bottom), (left, right) = window or ((0, source.height), (0, source.width))
+    (first_row, end_row), (first_column, end_column) = window or (
+        (0, source.height),
+        (0, source.width),
+    )
     size = sum(np.dtype(source.dtypes[k - 1]).itemsize for k in bands or source.indexes)
-    needed, present = (bottom - top) * (right - left) * size, os.path.getsize(path)
+    needed, present = (
+        (end_row - first_row) * (end_column - first_column) * size,
+        os.path.getsize(path),
+    )
     # A VRT is a text about other files.
     if needed > harmless and needed > ratio * present and source.driver != "VRT":
         raise InputError(
             f"{path}: is damaged, or nearly empty: {present} bytes that claim to hold {needed} of "
-            f"{bottom - top} × {right - left} pixels"
+            f"{end_row - first_row} × {end_column - first_column} pixels"
         )
 
 
@@ -190,28 +196,28 @@ def check_raw(path: str | Path, source: "DatasetReader") -> None:
     """Refuse a raster that is a map, or a crop, where one of the lines of a scanner is expected.
 
     **Raises:** `InputError`."""
-    place = source.transform
-    todo = "; give the whole image as the scanner took it, or the coefficients (RPC) of this one"
-    if source.crs is not None and not place.is_identity:
+    transform = source.transform
+    remedy = "; give the whole image as the scanner took it, or the coefficients (RPC) of this one"
+    if source.crs is not None and not transform.is_identity:
         raise InputError(
-            f"{path}: is a map, in {source.crs.to_string()[:60]} with pixels of {place.a:g}: its "
-            f"rows are not the lines of the scanner{todo}"
+            f"{path}: is a map, in {source.crs.to_string()[:60]} with pixels of {transform.a:g}: "
+            f"its rows are not the lines of the scanner{remedy}"
         )
     # GDAL's coordinates of pixels, rows downwards; programs leave them when they cut a part out
-    steps = (place.a, place.b, place.d, place.e)
-    if source.crs is None and steps == (1, 0, 0, 1) and not place.is_identity:
+    steps = (transform.a, transform.b, transform.d, transform.e)
+    if source.crs is None and steps == (1, 0, 0, 1) and not transform.is_identity:
         raise InputError(
-            f"{path}: is a part that begins at line {place.f:g}, pixel {place.c:g} of a larger "
-            f"image{todo}"
+            f"{path}: is a part that begins at line {transform.f:g}, pixel {transform.c:g} of a "
+            f"larger image{remedy}"
         )
 
 
-def as_type(values: np.ndarray, dtype: np.dtype | str, no_data: float | None = None) -> np.ndarray:
-    """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes `no_data`;
+def as_type(values: np.ndarray, dtype: np.dtype | str, nodata: float | None = None) -> np.ndarray:
+    """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes `nodata`;
     None: NaN stays, and is 0 of whole numbers."""
     if np.issubdtype(dtype, np.floating):
-        filled = values if no_data is None else np.where(np.isnan(values), no_data, values)
+        filled = values if nodata is None else np.where(np.isnan(values), nodata, values)
         return filled.astype(dtype)
     limits = np.iinfo(dtype)
-    filled = np.where(np.isnan(values), no_data or 0, np.rint(values))
+    filled = np.where(np.isnan(values), nodata or 0, np.rint(values))
     return np.clip(filled, limits.min, limits.max).astype(dtype)

@@ -20,7 +20,7 @@ _caches: set[str] = set()
 _processes: set["BaseProcess"] = set()
 _lock = threading.RLock()
 # The thread inside `defer_interrupts`, once per nested block.
-_inside: list[int] = []
+_deferring_threads: list[int] = []
 _put_off: list[Callable[[], None]] = []
 
 
@@ -45,20 +45,20 @@ def defer_interrupts() -> Iterator[None]:
     """An interrupt of the command line waits for the end of this block: for a few system calls that
     belong together, such as two renames, never for long work."""
     _lock.acquire()
-    _inside.append(threading.get_ident())
+    _deferring_threads.append(threading.get_ident())
     try:
         yield
     finally:
-        _inside.pop()
+        _deferring_threads.pop()
         _lock.release()
-        if _put_off and threading.get_ident() not in _inside:
+        if _put_off and threading.get_ident() not in _deferring_threads:
             _put_off[0]()
 
 
 def defer(action: Callable[[], None]) -> bool:
     """Whether this thread is inside `defer_interrupts`; then the action is called at the end of the
     block."""
-    if threading.get_ident() not in _inside:
+    if threading.get_ident() not in _deferring_threads:
         return False
     _put_off.append(action)
     return True

@@ -12,10 +12,10 @@ def map_in_threads(
     function: Callable[[Any], Any],
     items: Iterable[Any],
     at_once: int,
-    advance: Callable[[int], object] = lambda _done: None,
+    advance: Callable[[int], object] = lambda _count: None,
 ) -> list[Any]:
     """The results of all items, in their order. An item that finds too little memory beside others
-    is tried again alone, after them. `advance(done)`: called after each."""
+    is tried again alone, after them. `advance(count)`: called after each."""
     items = list(items)
 
     def attempt(item: Any) -> Any:

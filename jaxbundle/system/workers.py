@@ -50,19 +50,17 @@ class Workers:
 
     def run(self, tasks: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
         """Every task with its result or `Failed`, in the order of completion."""
-        tasks_left = list(tasks)[::-1]
-        while tasks_left or self._busy:
-            while tasks_left and len(self._busy) < self._number:
+        pending = list(tasks)[::-1]
+        while pending or self._busy:
+            while pending and len(self._busy) < self._number:
                 connection, process = self._idle.pop() if self._idle else self._start()
                 try:
-                    connection.send(tasks_left[-1])
+                    connection.send(pending[-1])
                 except OSError:  # it died without work
                     continue
-                self._busy[connection] = process, tasks_left.pop()
+                self._busy[connection] = process, pending.pop()
             ready = wait([*self._busy])
-            for connection in [
-                busy_connection for busy_connection in self._busy if busy_connection in ready
-            ]:
+            for connection in [candidate for candidate in self._busy if candidate in ready]:
                 process, task = self._busy.pop(connection)
                 try:
                     result = connection.recv()
@@ -76,12 +74,12 @@ class Workers:
 
     def _start(self) -> tuple[Any, Any]:
         context = multiprocessing.get_context("spawn")
-        our_end, their_end = context.Pipe()
-        process = context.Process(target=_serve, args=(their_end, self._function), daemon=True)
+        parent_end, child_end = context.Pipe()
+        process = context.Process(target=_serve, args=(child_end, self._function), daemon=True)
         process.start()
         watch_process(process)
-        their_end.close()
-        return our_end, process
+        child_end.close()
+        return parent_end, process
 
 
 def _describe_end(process: BaseProcess) -> str:

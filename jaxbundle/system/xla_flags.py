@@ -30,10 +30,12 @@ TRIED = (0, 12)
 def set_flags(compile_quickly: bool) -> None:
     """Add the flags above that this jaxlib knows and that the variable does not set."""
     flags = os.environ.get("XLA_FLAGS", "").split()
-    names_set = {flag.partition("=")[0] for flag in flags}
-    our_flags = [QUICK_LOOPS, ONE_AFTER_THE_OTHER, *[LITTLE_OPTIMISATION] * compile_quickly]
-    our_flags = [flag for flag in _known(our_flags) if flag.partition("=")[0] not in names_set]
-    os.environ["XLA_FLAGS"] = " ".join(flags + our_flags)
+    set_names = {flag.partition("=")[0] for flag in flags}
+    added_flags = [QUICK_LOOPS, ONE_AFTER_THE_OTHER, *[LITTLE_OPTIMISATION] * compile_quickly]
+    added_flags = [
+        flag for flag in _known_flags(added_flags) if flag.partition("=")[0] not in set_names
+    ]
+    os.environ["XLA_FLAGS"] = " ".join(flags + added_flags)
 
 
 def jaxlib_version() -> tuple[int, ...]:
@@ -41,15 +43,15 @@ def jaxlib_version() -> tuple[int, ...]:
     return tuple(map(int, re.findall(r"\d+", version("jaxlib"))[:3]))
 
 
-def _known(flags: list[str]) -> list[str]:
+def _known_flags(flags: list[str]) -> list[str]:
     """Those of the flags that this jaxlib knows."""
     release = jaxlib_version()[:2]
     if release <= (0, 10):
         return flags
     if release <= TRIED:
         return [flag for flag in flags if flag != QUICK_LOOPS]
-    listed = _list_flags()
-    return [flag for flag in flags if f"{flag.partition('=')[0]}=" in listed]
+    known_names = _list_flags()
+    return [flag for flag in flags if f"{flag.partition('=')[0]}=" in known_names]
 
 
 def _list_flags() -> str:

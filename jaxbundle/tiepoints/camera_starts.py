@@ -151,7 +151,9 @@ def _close(
         pairs = verify(with_interior(x), camera_of, features, matches, quiet, verification)
         # Only the matches that refine a rotation in every evaluation of the search.
         pairs = [
-            dataclasses.replace(pair, matches=pair.matches[batched.evenly_spaced(len(pair), MATCH_SLOTS)])
+            dataclasses.replace(
+                pair, matches=pair.matches[batched.evenly_spaced(len(pair), MATCH_SLOTS)]
+            )
             for pair in pairs
             if pair.kind != "rotation"
         ]

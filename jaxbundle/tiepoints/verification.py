@@ -410,7 +410,8 @@ def _classify(
 ) -> list[tuple[Bool[np.ndarray, " _"], float, str]]:
     """Matches, angle and kind of every pair."""
     rows = [
-        np.flatnonzero(good)[batched.evenly_spaced(int(good.sum()), MATCH_SLOTS)] for good, *_ in agreed
+        np.flatnonzero(good)[batched.evenly_spaced(int(good.sum()), MATCH_SLOTS)]
+        for good, *_ in agreed
     ]
     if not agreed:
         return []

@@ -72,7 +72,7 @@ def test_derivatives_are_those_of_the_ellipsoid():
     stack = lambda function: lambda x: jax.numpy.stack(function(el.WGS84, tuple(x)))
     back = jax.jit(jax.vmap(jax.jacfwd(stack(el.geodetic))))(np.stack(X, 1))
     forth = jax.jit(jax.vmap(jax.jacfwd(stack(el.earth_fixed))))(given.T)
-    np.testing.assert_allclose(back[:, 2], np.stack(el.up(given), 1), atol=1e-13)
+    np.testing.assert_allclose(back[:, 2], np.stack(el.vertical(given), 1), atol=1e-13)
     scale = np.array([1e-7, 1e-7, 1.0])
     product = back / scale[:, None] @ forth * scale
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-7)

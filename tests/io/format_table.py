@@ -72,7 +72,7 @@ def keys_table() -> str:
     lines = ["| reader | samples | objects | used | left | warned |", "|---|---|---|---|---|---|"]
     for name, keys in declarations().items():
         numbers = [len({*(k for one in keys for k in part(one))}) for part in
-                   (lambda k: k.used, lambda k: k.left, lambda k: k.warned)]  # fmt: skip
+                   (lambda k: k.used, lambda k: k.ignored, lambda k: k.warned)]  # fmt: skip
         samples = OF_MODULE.get(name, (name,) if name in SAMPLES else ())
         row = (f"`{name}`", len(samples), len(keys), *numbers)
         lines.append(f"| {' | '.join(map(str, row))} |")

@@ -215,7 +215,7 @@ def test_files_of_cameras(kind, tmp_path):
     from jaxbundle.io import read_cameras, read_network
 
     net = full_network("brown" if kind == "cameras" else "opencv")
-    cameras = net.cameras[:1] if CAMERA_KINDS[kind].one else net.cameras
+    cameras = net.cameras[:1] if CAMERA_KINDS[kind].single else net.cameras
     name = {"colmap-cameras": "cameras.txt", "opensfm-cameras": "camera_models.json",
             "ros": "camera_info.yaml", "cameramodel": "x.cameramodel", "autocal": "autocal.xml",
             "opencv": "x.yaml", "cameras": "x.toml"}[kind]  # fmt: skip

@@ -220,7 +220,7 @@ def test_a_kill_at_any_rename_leaves_old_or_new(tmp_path, inside):
 
         def action(out=out, rename=rename):
             if inside:
-                folders._make_work = lambda real: (real / INSIDE).mkdir() or real / INSIDE
+                folders._make_work_folder = lambda real: (real / INSIDE).mkdir() or real / INSIDE
             os.rename = rename
             write(out, NEWER)
 

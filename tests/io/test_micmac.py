@@ -98,7 +98,7 @@ def test_the_published_formula_is_the_camera(tmp_path, name):
     if camera.model != "opencv":
         px, py = camera.pixel_size
         found = found / [px, -py] + (np.array(SIZE) - 1) / 2
-    told = getattr(camera, "told", "")
+    told = getattr(camera, "message", "")
     assert ("pixel size is taken" in told) == (camera.model != "opencv" and name in EXACT)
     told = "" if name in EXACT else told
     limit = float(told.partition("difference ")[2].split()[0]) if told else 1e-9
@@ -245,8 +245,8 @@ def test_unified_distortions(tmp_path, kind):
     path = tmp_path / "AutoCal_cam.xml"
     path.write_text(unified(kind, V, S))
     (camera,) = read_cameras(path)
-    largest = float(re.search(r"largest difference ([\d.e+-]+) px", camera.told)[1])
-    assert kind in camera.told and largest < 12
+    largest = float(re.search(r"largest difference ([\d.e+-]+) px", camera.message)[1])
+    assert kind in camera.message and largest < 12
     found = images_of(get_model(camera.model), all_parameters(camera), rays * [1, -1, -1])
     if get_model(camera.model).unit == "mm":
         found = np.array(camera.image_size) / 2 - 0.5 + found / camera.pixel_size * [1, -1]

@@ -145,8 +145,8 @@ def test_a_skew_and_a_tilt_are_fitted_and_the_difference_told(tmp_path, skew, ti
     assert np.ptp(uv[inside], axis=0).min() > 450
     off = images_of(get_model(camera.model), all_parameters(camera), X[inside] * [1, -1, -1])
     off = np.linalg.norm(off - uv[inside], axis=1).max()
-    told = float(re.search(r"largest difference (\S+) px", camera.told)[1])
-    assert off <= 1.05 * told <= 0.5 and ("skew 0.4" in camera.told) == (skew > 0)
+    told = float(re.search(r"largest difference (\S+) px", camera.message)[1])
+    assert off <= 1.05 * told <= 0.5 and ("skew 0.4" in camera.message) == (skew > 0)
 
 
 BROKEN = {

@@ -95,7 +95,7 @@ def test_the_published_formula_is_the_camera(tmp_path, kind):
     (camera,) = read_cameras(tmp_path / "camera_models.json")
     ray = np.array([0.2, -0.3, -1.1])
     found = images_of(get_model(camera.model), all_parameters(camera), ray[None])[0]
-    fitted = getattr(camera, "told", "")
+    fitted = getattr(camera, "message", "")
     limit = float(fitted.partition("difference ")[2].split()[0]) if fitted else 1e-9
     assert bool(fitted) == (kind in ("fisheye62", "dual")) and limit < 1
     assert_allclose(found, in_pixels(*published(kind, ray[0], -ray[1], -ray[2])), atol=limit)

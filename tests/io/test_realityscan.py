@@ -16,8 +16,8 @@ from jaxbundle.io import read_network
 from jaxbundle.io.formats import TARGETS, recognise_format, recognise_target
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.realityscan import (
-    _from_heading,
     _heading_of,
+    _rotation_from_heading,
     write_realityscan_csv,
 )
 
@@ -123,12 +123,12 @@ def test_a_table(tmp_path, head):
 
 def test_headings_of_any_rotation():
     random = Rotation.random(200, random_state=3).as_matrix()
-    down = [_from_heading(0.4, np.radians(p), 0.3) for p in (90, -90, 89.99, 0)]
+    down = [_rotation_from_heading(0.4, np.radians(p), 0.3) for p in (90, -90, 89.99, 0)]
     for R in (*random, *down):
-        found = _from_heading(*np.radians(_heading_of(R)))
+        found = _rotation_from_heading(*np.radians(_heading_of(R)))
         assert_allclose(found, R, atol=1e-7)
     # north-up and vertical: all angles are 0, the camera looks down
-    assert_allclose(_from_heading(0, 0, 0), np.eye(3))
+    assert_allclose(_rotation_from_heading(0, 0, 0), np.eye(3))
 
 
 @pytest.mark.parametrize("name", ["realityscan", "realityscan.csv"])

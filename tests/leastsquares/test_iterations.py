@@ -34,11 +34,11 @@ def test_gauss_newton_that_diverges_has_not_converged(start):
     np.testing.assert_allclose(damped["x"].value, 0.0, atol=1e-6)
 
 
-STEP = {"last_size": 1.0, "first": False, "accept": True, "predicted": 0.04, "gain_ratio": 0.99}
+STEP = {"last_size": 1.0, "is_first": False, "accept": True, "predicted": 0.04, "gain_ratio": 0.99}
 
 
 @pytest.mark.parametrize("other", [
-    {}, {"gain_ratio": 0.9}, {"predicted": 0.06}, {"predicted": 0.15}, {"first": True},
+    {}, {"gain_ratio": 0.9}, {"predicted": 0.06}, {"predicted": 0.15}, {"is_first": True},
     {"accept": False},
 ])  # fmt: skip
 def test_the_damping_is_dropped_where_steps_converge_quadratically(other):

@@ -13,7 +13,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Rotation
 from jaxbundle.network.build import make_further
-from jaxbundle.network.kinds.antennas import antenna
+from jaxbundle.network.kinds.antennas import antenna_misclosure
 from jaxbundle.network.kinds.attitudes import ATTITUDE
 
 ARM, TURN = np.array([0.3, -0.2, 0.8]), np.radians([0.4, -0.3, 0.6])
@@ -114,7 +114,7 @@ def test_residuals_at_the_truth_are_those_of_the_formula(flight):
         pose = Pose().prepare(PoseValue(images.position[row], q))
         seen = declared[0].observations[0]
         strip = "north" if row < 5 else "south"
-        v = antenna(pose, ARM, (*SHIFT[strip], *DRIFT[strip]), (0.0,),
+        v = antenna_misclosure(pose, ARM, (*SHIFT[strip], *DRIFT[strip]), (0.0,),
                     jax.tree.map(lambda x, row=row: x[row], seen.measured))  # fmt: skip
         np.testing.assert_allclose(v, 0, atol=1e-9)
         boresight = Rotation().prepare(declared[1].tables[0].value[0])

@@ -17,7 +17,7 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.network.build import make_further
 from jaxbundle.network.kinds.mountings import observe_mountings, read_mountings
-from jaxbundle.network.kinds.rigs import MountedPose, _start
+from jaxbundle.network.kinds.rigs import MountedPose, _start_mounting
 from jaxbundle.planning.stations import Stations
 
 T = np.array([0.3, 0.02, -0.01])
@@ -216,7 +216,7 @@ def test_a_mounting_starts_where_the_images_are_unless_it_is_held(sigma):
     there is nothing else."""
     (known,) = read_mountings("rig", {"right": GIVEN | sigma}, 1.0).values()
     images = MountedPose(T + 0.1, np.eye(3))
-    start, alone = _start(images, known), _start(None, known)
+    start, alone = _start_mounting(images, known), _start_mounting(None, known)
     held = not sigma
     np.testing.assert_allclose(start.position, T if held else images.position)
     np.testing.assert_allclose(start.rotation, R if held else images.rotation, atol=1e-12)

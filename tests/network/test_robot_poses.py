@@ -53,9 +53,9 @@ def hands(made, type="eye-in-hand", noise=0.0, seed=4):
     M = np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in images.angles])
     camera = Rigid(np.swapaxes(M, 1, 2), images.position)  # camera → object
     if type == "eye-in-hand":  # object → base after camera → object after hand → camera
-        hand = Y.of(camera).of(X.inverse)
+        hand = Y.compose(camera).compose(X.inverse)
     else:  # X: camera in the base; Y: object in the hand
-        hand = X.of(camera.inverse).of(Y.inverse)
+        hand = X.compose(camera.inverse).compose(Y.inverse)
     turn = Rotation.from_rotvec(noise * SIGMA_R * random.normal(size=(len(M), 3))).as_matrix()
     q = Rotation.from_matrix(turn @ hand.R).as_quat()
     p = hand.t + noise * SIGMA_P * random.normal(size=hand.t.shape)

@@ -153,7 +153,7 @@ def test_control_that_rays_miss_is_suspect_if_no_datum_is_left_without_it(
     network = SimpleNamespace(points=points, further=(), warn=lambda said: said)
     result = start_values.Oriented(network, "in the frame given", {}, {}, ())
     for name, found in {
-        "check_tables": network, "sights": seen, "_orient": (model, ""), "_result": result,
+        "check_tables": network, "make_sights": seen, "_orient": (model, ""), "_result": result,
         "_are_gross": point < missed, "name_contradiction": "", "_control_contradicts": False,
     }.items():  # fmt: skip
         monkeypatch.setattr(start_values, name, lambda *_, found=found, **options: found)

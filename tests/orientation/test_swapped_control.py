@@ -30,9 +30,9 @@ def lists(n, *exchanges, wrong=()):
 def test_two_exchanged_points_are_found(n):
     found = contradiction(*lists(n, (0, 2)))
     assert found.exchanges[0] == (0, 2)
-    assert found.after < 0.01 < 0.5 < found.before
+    assert found.misfit_after < 0.01 < 0.5 < found.misfit_before
     if n >= 6:  # four or more of the others agree: there is no other explanation
-        assert found.together and found.exchanges == [(0, 2)] and not found.wrong
+        assert found.all_at_once and found.exchanges == [(0, 2)] and not found.wrong
 
 
 @pytest.mark.parametrize("n", [2, 3, 5, 20])
@@ -42,14 +42,14 @@ def test_points_that_fit_contradict_nothing(n):
 
 def test_two_exchanges_and_a_wrong_point_of_many():
     found = contradiction(*lists(20, (0, 2), (5, 11), wrong=[7]))
-    assert found.together and found.exchanges == [(0, 2), (5, 11)] and found.wrong == [7]
+    assert found.all_at_once and found.exchanges == [(0, 2), (5, 11)] and found.wrong == [7]
 
 
 def test_the_corners_of_a_square_have_two_explanations():
     """With A and B exchanged, C and D may be: the square turned over fits as well."""
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
     found = contradiction(square @ TURN.T, square[[1, 0, 2, 3]])
-    assert not found.together and {(0, 1), (2, 3)} <= set(found.exchanges)
+    assert not found.all_at_once and {(0, 1), (2, 3)} <= set(found.exchanges)
 
 
 def test_five_of_seven_points_agree_in_threes():
@@ -57,13 +57,13 @@ def test_five_of_seven_points_agree_in_threes():
     source, target = lists(7, wrong=[2])
     target[5] += [-0.8, 0.3, 0.9]
     found = contradiction(source, target)
-    assert found.together and found.wrong == [2, 5] and not found.exchanges
+    assert found.all_at_once and found.wrong == [2, 5] and not found.exchanges
 
 
 def test_a_wrong_point_of_four_is_one_explanation():
     """The other three have two conditions left, and fit."""
     found = contradiction(*lists(4, wrong=[3]))
-    assert not found.together and 3 in found.wrong
+    assert not found.all_at_once and 3 in found.wrong
     # Three always have a similarity that nearly fits two of them: no point of these is left out.
     three = contradiction(*lists(3, wrong=[1]))
     assert three is None or not three.wrong
@@ -88,7 +88,7 @@ def test_the_tolerance_is_that_of_the_sigma_of_control():
     target = target + 0.5 * np.random.default_rng(1).standard_normal(target.shape)
     assert contradiction(source, target, np.full((9, 3), 0.5)) is None
     exact = contradiction(source, target, np.full((9, 3), np.nan))
-    assert exact is None or exact.before > 0.5
+    assert exact is None or exact.misfit_before > 0.5
     far = target.copy()
     far[[0, 2]] = far[[2, 0]] + [[30, 0, 0], [-30, 0, 0]]
     assert contradiction(source, far, np.full((9, 3), 0.5)) is not None

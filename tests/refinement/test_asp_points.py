@@ -140,7 +140,7 @@ def test_columns_become_pixels_and_latitude_comes_first(tmp_path):
         "5 23.7 160.1 427.1 1.0 2.0 3.0 image1.tif 124.5 19.7 1.0 0.5 image2.tif 254.3 73.9 1 1\n"
     )
     found = read_gcp(tmp_path / "a.gcp")
-    assert found.place.tolist() == [[160.1, 23.7, 427.1]] and found.image[1] == "image2.tif"
+    assert found.geographic.tolist() == [[160.1, 23.7, 427.1]] and found.image[1] == "image2.tif"
     assert found.xy[0].tolist() == [19.7, 124.5] and found.xy_sigma[0].tolist() == [0.5, 1.0]
     (tmp_path / "a__b.match").write_bytes(match_file([(19.5, 124.5)], [(73.25, 254.0)]))
     first, second = read_match(tmp_path / "a__b.match")

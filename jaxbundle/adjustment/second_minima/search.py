@@ -55,7 +55,7 @@ from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import UNIT
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import START_VALUE_LIMITS, Model, grow, intersect
-from jaxbundle.orientation.rays import MIN_COSINE, Sights, sights
+from jaxbundle.orientation.rays import MIN_COSINE, Sights, make_sights
 
 # `minimise(problem, start)` iterates from given values, `max_steps` at most if given; returns the
 # problem as it ended.
@@ -297,7 +297,7 @@ class _State:
     def _sights(self) -> Sights:
         network = self.problem.network
         cameras = adjusted_cameras(self.problem, self.first.adjusted)
-        return sights(network.replace(cameras=tuple(cameras.values())))
+        return make_sights(network.replace(cameras=tuple(cameras.values())))
 
     # --- adjustment -------------------------------------------------------------------------
 

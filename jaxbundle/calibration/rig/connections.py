@@ -122,7 +122,12 @@ def connect(
     them; `NotSolvedError` if the motion of the rig, which alone could tie them, does not.
     """
     views, body = list(views), np.asarray(bodies)
-    camera_groups, board_groups, motion_ties, open_motions = _Groups(len(cameras)), _Groups(len(boards)), [], []
+    camera_groups, board_groups, motion_ties, open_motions = (
+        _Groups(len(cameras)),
+        _Groups(len(boards)),
+        [],
+        [],
+    )
     while True:
         poses = _poses(views, camera_groups, board_groups)
         if _join_cameras(poses, views, camera_groups) or _join_boards(poses, board_groups, body):
@@ -134,8 +139,14 @@ def connect(
         names_of = lambda names, rows: tuple(names[i] for i in rows)
         motion_ties.append(
             MotionTie(
-                (names_of(cameras, camera_groups.members(g1)), names_of(cameras, camera_groups.members(g2))),
-                (names_of(boards, board_groups.members(h1)), names_of(boards, board_groups.members(h2))),
+                (
+                    names_of(cameras, camera_groups.members(g1)),
+                    names_of(cameras, camera_groups.members(g2)),
+                ),
+                (
+                    names_of(boards, board_groups.members(h1)),
+                    names_of(boards, board_groups.members(h2)),
+                ),
                 number,
                 motion.open.shape[1],
             )
@@ -154,7 +165,10 @@ def connect(
     return Connections(
         [place @ to_first_camera for place in camera_groups.place],
         groups,
-        [np.linalg.inv(board_groups.place[r]) @ place for r, place in zip(references, board_groups.place)],
+        [
+            np.linalg.inv(board_groups.place[r]) @ place
+            for r, place in zip(references, board_groups.place)
+        ],
         tuple(motion_ties),
         tuple(names for names in separate if len(names) > 1),
     )

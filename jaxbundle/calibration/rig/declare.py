@@ -310,7 +310,7 @@ def _free_mountings(rig: Rig) -> Float[np.ndarray, "cameras 6"]:
     free[0] = 0
     for k, camera in enumerate(rig.cameras):
         if camera.id in rig.known.mountings:
-            free[k] = ~np.repeat(rig.known.mountings[camera.id].held, 3)
+            free[k] = ~np.repeat(rig.known.mountings[camera.id].is_held, 3)
     return free
 
 

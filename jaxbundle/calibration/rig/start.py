@@ -306,9 +306,9 @@ def _hold(
     position, rotation = np.array(mounting.position), np.array(mounting.rotation)
     for name, mounting_given in known_mountings.mountings.items():
         k = cameras.index(name)
-        if mounting_given.held[0]:
+        if mounting_given.is_held[0]:
             position[k] = mounting_given.position
-        if mounting_given.held[1]:
+        if mounting_given.is_held[1]:
             M = matrix_from_omega_phi_kappa(not_none(mounting_given.angles))
             rotation[k] = quaternion_from_matrix(M)
     return PoseValue(position, rotation)

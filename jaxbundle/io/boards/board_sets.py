@@ -81,18 +81,18 @@ def read_boards(path: str | Path) -> BoardFile:
 
 def _board(path: Path, where: str, values: dict[str, Any]) -> Board:
     """One board, or that of a target file."""
-    keys_of_board = {key: value for key, value in values.items() if key in OF_BOARD}
+    board_settings = {key: value for key, value in values.items() if key in OF_BOARD}
     if "target" in values:
-        if keys_of_board:
+        if board_settings:
             raise InputError(
-                f"{where}target gives the whole board; omit {', '.join(keys_of_board)}"
+                f"{where}target gives the whole board; omit {', '.join(board_settings)}"
             )
         return read_target(path.parent / _text(where, "target", values["target"]))
     for key in ("columns", "rows", "square"):
-        if key not in keys_of_board:
+        if key not in board_settings:
             raise InputError(f"{where}{key} is missing; expected columns, rows and square")
     with naming_file(where.removesuffix(": ")):  # a Board checks its own values
-        return Board(**keys_of_board)
+        return Board(**board_settings)
 
 
 def _text(where: str, key: str, value: Any) -> str:

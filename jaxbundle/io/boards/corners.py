@@ -39,7 +39,7 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     **Raises:** `InputError` naming file, line and photograph.
     """
     path, number = Path(path), len(require_board(board).ids)
-    legend, views, reduced = None, {}, {}
+    legend, views, reduced_names = None, {}, {}
     for row in TextRows(path):
         # Vnlog: the first line of one # is the legend, those of ## and #! are comments.
         if row.text.startswith("#"):
@@ -57,7 +57,7 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
         cells = dict(zip(legend, row.words))
         views.setdefault(cells["filename"], []).append(_point(row, cells))
         if cells.get("level", "0").isdigit() and int(cells.get("level", "0")) > 0:
-            reduced[cells["filename"]] = None
+            reduced_names[cells["filename"]] = None
     # One row of "-" stands for a whole photograph, unless the board itself has one point.
     failed_names = [
         name
@@ -74,10 +74,10 @@ def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> B
     xy = np.array([views[name] for name in names], float).reshape(-1, number, 2)
     w, h = (int(n) for n in image_size)
     warnings = ()
-    if reduced:
+    if reduced_names:
         warnings = (
-            f"{count(len(reduced), 'photograph')} with points found in a reduced image, which are "
-            f"less precise: {list_some(reduced)}",
+            f"{count(len(reduced_names), 'photograph')} with points found in a reduced image, "
+            f"which are less precise: {list_some(reduced_names)}",
         )
     return BoardViews(
         board,

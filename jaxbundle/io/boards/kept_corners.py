@@ -80,10 +80,10 @@ class KeptCorners:
         if stored_row is not None and stored_row[:2] == size_and_time:
             return stored_row[2]
         try:
-            content_read = read_content(photograph, text=False)
+            photograph_bytes = read_content(photograph, text=False)
         except InputError:
             return ""
-        content = hashlib.blake2b(content_read, digest_size=16).hexdigest()
+        content = hashlib.blake2b(photograph_bytes, digest_size=16).hexdigest()
         self._write(
             "INSERT OR REPLACE INTO photographs VALUES (?, ?, ?, ?)", path, *size_and_time, content
         )
@@ -98,9 +98,9 @@ class KeptCorners:
         )
         if result is None:
             return None
-        columns, rows, xy, why = result
-        if xy is None and isinstance(why, str):
-            return why
+        columns, rows, xy, reason = result
+        if xy is None and isinstance(reason, str):
+            return reason
         # Of a damaged file a cell may hold anything: the photograph is searched again.
         if isinstance(xy, bytes) and isinstance(columns, int) and isinstance(rows, int):
             if len(xy) == 16 * len(require_board(board).ids):
@@ -109,9 +109,9 @@ class KeptCorners:
 
     def keep(self, content: str, board: Board, look: Look) -> None:
         """Add a search result; it is in the file when this returns."""
-        columns, rows, points, why = None, None, None, None
+        columns, rows, points, reason = None, None, None, None
         if isinstance(look, str):
-            why = look
+            reason = look
         else:
             (columns, rows), xy = look
             points = np.ascontiguousarray(xy, "<f8").tobytes()
@@ -122,7 +122,7 @@ class KeptCorners:
             columns,
             rows,
             points,
-            why,
+            reason,
         )
 
     def _first_row(self, question: str, *values: SqlValue) -> tuple | None:

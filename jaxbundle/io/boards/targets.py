@@ -49,12 +49,12 @@ def _board(path: str | Path, fields: JsonFields) -> Board:
     if kind not in TYPES:
         raise InputError(f"{path}: target_type {kind}: expected {' or '.join(TYPES)}")
     if kind == "aprilgrid":
-        columns, rows = (fields.integer(key, least=1) for key in ("tagCols", "tagRows"))
+        columns, rows = (fields.integer(key, minimum=1) for key in ("tagCols", "tagRows"))
         side, gap = fields.number("tagSize"), fields.number("tagSpacing")
         if not gap > 0:
             raise InputError(f"{path}: tagSpacing {gap:g}: expected a positive part of tagSize")
         return Board(columns, rows, side * (1 + gap), kind, marker=side)
-    columns, rows = (fields.integer(key, least=1) for key in ("targetCols", "targetRows"))
+    columns, rows = (fields.integer(key, minimum=1) for key in ("targetCols", "targetRows"))
     if kind == "circlegrid":
         asymmetric = fields.get("asymmetricGrid", False)
         if asymmetric not in CIRCLES:

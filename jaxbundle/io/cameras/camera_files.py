@@ -40,8 +40,8 @@ class CameraFormat:
     looks: str
 
 
-def _single(read_camera: Callable[[Path], Camera]) -> Callable[[Path], Sequence[Camera]]:
-    return lambda path: (read_camera(path),)
+def _single_camera_reader(reader: Callable[[Path], Camera]) -> Callable[[Path], Sequence[Camera]]:
+    return lambda path: (reader(path),)
 
 
 def _is_colmap_cameras(path: Path) -> bool:
@@ -66,10 +66,12 @@ CAMERA_FORMATS: dict[str, CameraFormat] = {
     "opensfm-cameras": CameraFormat(
         is_opensfm_cameras, read_opensfm_cameras, CAMERA_INPUTS["opensfm-cameras"]
     ),
-    "autocal": CameraFormat(is_autocal, _single(read_autocal), CAMERA_INPUTS["autocal"]),
+    "autocal": CameraFormat(
+        is_autocal, _single_camera_reader(read_autocal), CAMERA_INPUTS["autocal"]
+    ),
     "metashape-lens": CameraFormat(
         is_metashape_lens,
-        _single(read_metashape_lens),
+        _single_camera_reader(read_metashape_lens),
         CAMERA_INPUTS["metashape-lens"],
     ),
     "ros-ini": CameraFormat(
@@ -79,12 +81,12 @@ CAMERA_FORMATS: dict[str, CameraFormat] = {
     ),
     "slam-yaml": CameraFormat(
         lambda path: is_slam_yaml(path) and not is_orb_slam_pair(path),
-        _single(read_slam_yaml),
+        _single_camera_reader(read_slam_yaml),
         CAMERA_INPUTS["slam-yaml"],
     ),
     "opencv": CameraFormat(
         lambda path: is_opencv(path) and not is_opencv_rig(path),
-        _single(read_opencv),
+        _single_camera_reader(read_opencv),
         CAMERA_INPUTS["opencv"],
     ),
 }

@@ -65,5 +65,5 @@ def _words(text: str) -> list[Any]:
 
 def _number(word: str) -> float | int:
     digits = word.lstrip("+-")
-    is_whole = digits.isascii() and digits.isdigit() and len(digits) < 16
-    return int(word) if is_whole else float(word.replace(".Nan", "nan").replace(".Inf", "inf"))
+    is_integer = digits.isascii() and digits.isdigit() and len(digits) < 16
+    return int(word) if is_integer else float(word.replace(".Nan", "nan").replace(".Inf", "inf"))

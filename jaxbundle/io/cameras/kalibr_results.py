@@ -76,20 +76,20 @@ def _camera(path: Path, id: str, text: str) -> "Calibrated":
 
 
 def _values(
-    where: str, field: str, text: str, names: Sequence[str]
+    where: str, name: str, text: str, names: Sequence[str]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Values and σ of a line."""
-    match = re.search(VALUES.format(field), text)
+    match = re.search(VALUES.format(name), text)
     if match is None:
-        raise InputError(f"{where}: {field}: [values] +- [σ] is missing")
+        raise InputError(f"{where}: {name}: [values] +- [σ] is missing")
     numbers = []
     for part in match.groups():
         words = part.replace(",", " ").split()
         if len(words) != len(names):
-            raise InputError(f"{where}: {field} has {len(words)} numbers; expected {len(names)}")
+            raise InputError(f"{where}: {name} has {len(words)} numbers; expected {len(names)}")
         row = TextRow(Path(where), 0, " ".join(words))
         try:
             numbers.append(dict(zip(names, row.numbers(names).tolist())))
         except InputError:
-            raise InputError(f"{where}: {field}: expected finite numbers") from None
+            raise InputError(f"{where}: {name}: expected finite numbers") from None
     return numbers[0], numbers[1]

@@ -114,18 +114,15 @@ def nearest_camera(
     if has_ray.mean() < MEASURABLE:
         raise NoPlaceError(
             f"{where}: only {100 * has_ray.mean():.0f} % of the image has rays: its distortion "
-            "turns "
-            "back inside the image"
+            "turns back inside the image"
         )
-    uv, rays = (
-        uv[has_ray],
-        rays[has_ray] * [1, -1, -1],
-    )  # y up, looking along −z, as all models here
-    wide = (MIRROR if "xi" in camera.start else FISHEYE) if camera.fisheye else ()
-    source = get_model(wide[0][0] if wide else "opencv")
-    narrow = (-rays[:, 2] > np.cos(np.radians(settings.perspective_angle))).all()
+    # Rays with y up, looking along −z, as of all models here.
+    uv, rays = uv[has_ray], rays[has_ray] * [1, -1, -1]
+    wide_candidates = (MIRROR if "xi" in camera.start else FISHEYE) if camera.fisheye else ()
+    source = get_model(wide_candidates[0][0] if wide_candidates else "opencv")
+    is_narrow = (-rays[:, 2] > np.cos(np.radians(settings.perspective_angle))).all()
     fits, problem = [], ""
-    for name, free in (*wide, *(PERSPECTIVE if narrow else ())):
+    for name, free_names in (*wide_candidates, *(PERSPECTIVE if is_narrow else ())):
         target = get_model(name)
         if target.unit == "mm" and camera.pixel_size is None:
             continue
@@ -133,13 +130,13 @@ def nearest_camera(
         xy = (uv - origin) / step
         starts = start_values(source, camera.start, target, sizes)
         try:
-            values = fit_parameters(target, rays, xy, starts, free)
+            values = fit_parameters(target, rays, xy, starts, free_names)
         except ValueError as error:
             problem = str(error)
             continue
-        difference = np.linalg.norm((images_of(target, values, rays) - xy) * step, axis=1)
-        largest = float(difference.max()) if np.isfinite(difference).all() else np.inf
-        fits.append((largest, float(np.sqrt(np.mean(difference**2))), target, values))
+        residuals = np.linalg.norm((images_of(target, values, rays) - xy) * step, axis=1)
+        largest = float(residuals.max()) if np.isfinite(residuals).all() else np.inf
+        fits.append((largest, float(np.sqrt(np.mean(residuals**2))), target, values))
         if largest <= settings.good_fit:
             break
     if not fits or not np.isfinite(min(fits, key=lambda fit: fit[0])[0]):
@@ -159,24 +156,24 @@ class FittedCamera(Camera):
     """A camera with a message about how it was read: its differences from one of another program,
     entries of the file that are not understood."""
 
-    told: str = ""
+    message: str = ""
 
 
 def with_messages(camera: Camera, *messages: str) -> Camera:
     """The camera with further messages, if there are any."""
-    joined_messages = "; ".join([*fit_messages([camera]), *messages])
+    message = "; ".join([*fit_messages([camera]), *messages])
     fields = {field.name: getattr(camera, field.name) for field in dataclasses.fields(Camera)}
-    return FittedCamera(**fields, told=joined_messages) if messages else camera
+    return FittedCamera(**fields, message=message) if messages else camera
 
 
 def fit_camera(
     id: str,
     camera: Foreign,
     where: str,
-    why: str,
+    reason: str,
     settings: NearestCameraSettings = SETTINGS,
 ) -> FittedCamera:
-    """The nearest of our cameras; `why` the original model has no equal here.
+    """The nearest of our cameras; `reason`: why the original model has no equal here, in words.
 
     **Raises:** `NoPlaceError`.
     """
@@ -189,14 +186,14 @@ def fit_camera(
         entry,
         image_size=(int(size[0]), int(size[1])),
         pixel_size=pixel and tuple(pixel),
-        told=f"camera {id!r} {why}: {message}",
+        message=f"camera {id!r} {reason}: {message}",
     )
 
 
 def fit_messages(cameras: Iterable[Camera]) -> tuple[str, ...]:
     """Messages about how cameras were read."""
-    messages = (camera.told for camera in cameras if isinstance(camera, FittedCamera))
-    return tuple(dict.fromkeys(filter(None, messages)))
+    texts = (camera.message for camera in cameras if isinstance(camera, FittedCamera))
+    return tuple(dict.fromkeys(filter(None, texts)))
 
 
 def _rays(
@@ -210,7 +207,7 @@ def _rays(
     # The start has no distortion: θ = r for a fisheye, θ = arctan r for a perspective camera.
     m = tangents if camera.fisheye else tangents * np.arctan(r) / np.where(r > 0, r, 1)
     with local_x64():
-        newton = partial(_newton, camera.formula, camera.parameters, settings.max_step, uv)
+        newton = partial(_newton_steps, camera.formula, camera.parameters, settings.max_step, uv)
         for _ in range(settings.max_iterations):
             step = np.nan_to_num(newton(m)[0], posinf=0.0, neginf=0.0)
             m = m + step
@@ -219,11 +216,11 @@ def _rays(
                 break
         _, miss, det = map(np.asarray, newton(m))
         # det < 0: an image that is turned inside out, beyond the fold of the distortion
-        return np.asarray(jax.vmap(_direction)(m)), (miss < settings.max_miss) & (det > 0)
+        return np.asarray(jax.vmap(_ray_direction)(m)), (miss < settings.max_miss) & (det > 0)
 
 
 @partial(compile_once, static=(0, 2))
-def _newton(
+def _newton_steps(
     formula: Formula,
     p: Any,
     max_step: float,
@@ -235,7 +232,7 @@ def _newton(
     def newton_step(
         uv: Float[Array, "2"], m: Float[Array, "2"]
     ) -> tuple[Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
-        image = lambda m: formula(p, *_direction(m))
+        image = lambda m: formula(p, *_ray_direction(m))
         (a, b), (c, d) = jax.jacfwd(image)(m)
         du, dv = uv - image(m)
         # Cramer's rule: for 2 × 2 it needs no factorisation, and its determinant tells the fold
@@ -247,7 +244,7 @@ def _newton(
     return jax.vmap(newton_step)(uv, m)
 
 
-def _direction(m: Float[AnyArray, "2"]) -> Float[Array, "3"]:
+def _ray_direction(m: Float[AnyArray, "2"]) -> Float[Array, "3"]:
     """The unit vector at an angle from the axis: m is this angle times its direction.
 
     Angles, unlike tangents, have no pole at 90°, which fisheyes pass.

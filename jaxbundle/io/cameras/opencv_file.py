@@ -53,11 +53,11 @@ from jaxbundle.io.cameras.file_storage import storage_entries
 from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fit_camera, with_messages
 from jaxbundle.io.cameras.spellings import (
     CORE,
-    LEFT,
+    IGNORED,
     MEANING,
     MODEL_NAMES,
     TILT,
-    Found,
+    EntriesByMeaning,
     camera_entries,
     cameras_within,
     fold,
@@ -182,31 +182,31 @@ def _only_camera(path: Path, entries: Mapping[str, Any], unknown: UnknownKeys) -
     """The entries of the camera, also where they stand within another object."""
     if has_camera(entries):
         return entries
-    nested_cameras = list(cameras_within(entries))
-    if len(nested_cameras) != 1 or meaning_of(*nested_cameras[0]) == "camera_matrix":
+    cameras = list(cameras_within(entries))
+    if len(cameras) != 1 or meaning_of(*cameras[0]) == "camera_matrix":
         return entries
-    name, entries_of_camera = nested_cameras[0]
+    name, inner_entries = cameras[0]
     # {"camera": {…}, "software": …}: what stands around it is checked as well
-    around = {fold(key): key for key in entries if key != name}
-    unknown.check((around[key] for key in LEFT.unknown(around)), Keys(()), path)
-    return entries_of_camera
+    outer_keys = {fold(key): key for key in entries if key != name}
+    unknown.check((outer_keys[key] for key in IGNORED.unknown(outer_keys)), Keys(()), path)
+    return inner_entries
 
 
-def camera_of(path: str | Path, by_meaning: Found, id: str) -> Camera:
+def camera_of(path: str | Path, entries: EntriesByMeaning, id: str) -> Camera:
     """The camera of the entries by meaning.
 
     **Raises:** `InputError` naming the entry.
     """
-    core, skew = _core(path, by_meaning)
-    mirror = _mirror(path, by_meaning)
-    fisheye = not mirror and _is_fisheye(path, by_meaning)
-    values = _coefficients(path, by_meaning, fisheye)
+    core, skew = _pinhole_parameters(path, entries)
+    mirror = _mirror_parameter(path, entries)
+    fisheye = not mirror and _is_fisheye(path, entries)
+    values = _coefficients(path, entries, fisheye)
     coefficients, tilt = values[: len(ORDER)], values[len(ORDER) :]
-    short = "a fisheye" if fisheye else "an omnidirectional camera" if mirror else ""
-    if short and (any(coefficients[4:]) or any(tilt)):
-        raise InputError(f"{path}: {len(values)} distortion coefficients; {short} has 4")
-    size = _image_size(path, by_meaning)
-    core, size, messages = _published_image(path, by_meaning, core, size)
+    short_model = "a fisheye" if fisheye else "an omnidirectional camera" if mirror else ""
+    if short_model and (any(coefficients[4:]) or any(tilt)):
+        raise InputError(f"{path}: {len(values)} distortion coefficients; {short_model} has 4")
+    size = _image_size(path, entries)
+    core, size, messages = _published_image(path, entries, core, size)
     names = ORDER if not fisheye else ("k1", "k2", "k3", "k4")
     camera = Camera(
         id=id,
@@ -216,18 +216,20 @@ def camera_of(path: str | Path, by_meaning: Found, id: str) -> Camera:
     )
     check_camera(camera, f"{path}, ")
     if skew or any(tilt):
-        camera = _fit(Path(path), camera, skew, tilt)
+        camera = _fit_nearest(Path(path), camera, skew, tilt)
     return with_messages(camera, *messages)
 
 
-def _core(path: str | Path, by_meaning: Found) -> tuple[dict[str, float], float]:
+def _pinhole_parameters(
+    path: str | Path, entries: EntriesByMeaning
+) -> tuple[dict[str, float], float]:
     """fx, fy, cx, cy and the skew."""
-    extra = _number(path, by_meaning, "skew", 0.0)
-    if "camera_matrix" not in by_meaning and {"fx", "fy"} <= by_meaning.keys():
-        return {name: _number(path, by_meaning, name) for name in CORE}, extra
-    if "camera_matrix" not in by_meaning:
+    extra = _number(path, entries, "skew", 0.0)
+    if "camera_matrix" not in entries and {"fx", "fy"} <= entries.keys():
+        return {name: _number(path, entries, name) for name in CORE}, extra
+    if "camera_matrix" not in entries:
         raise InputError(f"{path}: camera_matrix is missing")
-    name, value = by_meaning["camera_matrix"]
+    name, value = entries["camera_matrix"]
     # As Kalibr and ROS write `intrinsics`.
     if "intrinsic" in name.lower() and isinstance(value, list) and len(value) == 4:
         four = matrix_of(path, name, value, None).tolist()
@@ -250,69 +252,72 @@ def _core(path: str | Path, by_meaning: Found) -> tuple[dict[str, float], float]
     core: dict[str, float] = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
     for key in CORE:
         # Programs that write both round one of them.
-        if key in by_meaning and abs(_number(path, by_meaning, key) - core[key]) > 1e-3:
+        if key in entries and abs(_number(path, entries, key) - core[key]) > 1e-3:
             raise InputError(
-                f"{path}: {by_meaning[key][0]} is {by_meaning[key][1]:g}, but {name} has "
-                f"{core[key]:g}; "
+                f"{path}: {entries[key][0]} is {entries[key][1]:g}, but {name} has {core[key]:g}; "
                 "expected equal numbers"
             )
     if K[0, 1] and extra and K[0, 1] != extra:
-        raise InputError(
-            f"{path}: {by_meaning['skew'][0]} and {name}[0][1] differ; expected one skew"
-        )
+        raise InputError(f"{path}: {entries['skew'][0]} and {name}[0][1] differ; expected one skew")
     return core, float(K[0, 1]) or extra
 
 
-def _mirror(path: str | Path, by_meaning: Found) -> dict[str, float]:
+def _mirror_parameter(path: str | Path, entries: EntriesByMeaning) -> dict[str, float]:
     """ξ of an omnidirectional camera; nothing of others.
 
     **Raises:** `InputError` for a lens model that is another."""
-    if "xi" not in by_meaning:
+    if "xi" not in entries:
         return {}
     for meaning in MODEL_KEYS:
-        key, kind = by_meaning.get(meaning, ("", ""))
-        folded = fold(str(kind))
-        if folded and not OMNIDIRECTIONAL.search(folded) and MODEL_NAMES.get(folded) != "opencv":
+        key, kind = entries.get(meaning, ("", ""))
+        folded_name = fold(str(kind))
+        if (
+            folded_name
+            and not OMNIDIRECTIONAL.search(folded_name)
+            and MODEL_NAMES.get(folded_name) != "opencv"
+        ):
             raise InputError(
                 f"{path}: {key} {show(kind)} with xi is not known here; expected OpenCV's "
                 "omnidirectional camera"
             )
-    name, value = by_meaning["xi"]
+    name, value = entries["xi"]
     values = [value] if _is_number(value) else matrix_of(path, name, value, None).tolist()
     if len(values) != 1:
         raise InputError(f"{path}: {name} has {len(values)} values; expected a finite number")
     return {"xi": float(values[0])}
 
 
-def _number(path: str | Path, by_meaning: Found, kind: str, default: float | None = None) -> float:
-    if kind not in by_meaning and default is not None:
+def _number(
+    path: str | Path, entries: EntriesByMeaning, meaning: str, default: float | None = None
+) -> float:
+    if meaning not in entries and default is not None:
         return default
-    if kind not in by_meaning:
-        raise InputError(f"{path}: {kind} is missing")
-    name, value = by_meaning[kind]
+    if meaning not in entries:
+        raise InputError(f"{path}: {meaning} is missing")
+    name, value = entries[meaning]
     if not _is_number(value):
         raise InputError(f"{path}: {name} is {show(value)}; expected a finite number")
     return float(value)
 
 
-def _is_fisheye(path: str | Path, by_meaning: Found) -> bool:
+def _is_fisheye(path: str | Path, entries: EntriesByMeaning) -> bool:
     """Whether the model is that of `cv2.fisheye`.
 
     **Raises:** `InputError` for a lens model that is not OpenCV's."""
-    _, flag = by_meaning.get("fisheye_model", ("", False))
+    _, flag = entries.get("fisheye_model", ("", False))
     if isinstance(flag, str):
         flag = flag.strip().lower() in ("1", "true", "yes")
     models = [flag is True or (_is_number(flag) and flag == 1)]
     for meaning in MODEL_KEYS:
-        key, kind = by_meaning.get(meaning, ("", ""))
+        key, kind = entries.get(meaning, ("", ""))
         if not kind:
             continue
-        folded = fold(str(kind))
-        model = MODEL_NAMES.get(folded)
-        foreign = model is None and FOREIGN_MODELS.search(folded)
+        folded_name = fold(str(kind))
+        model = MODEL_NAMES.get(folded_name)
+        foreign = model is None and FOREIGN_MODELS.search(folded_name)
         # `model` may be a product's name; without any distortion all models are the same
-        is_model_name = model is None and meaning == "distortion_model"
-        if foreign or (is_model_name and not _all_zero(path, by_meaning)):
+        is_unknown = model is None and meaning == "distortion_model"
+        if foreign or (is_unknown and not _has_zero_distortion(path, entries)):
             raise InputError(
                 f"{path}: {key} {show(kind)} is not known here; expected plumb_bob, "
                 "rational_polynomial (OpenCV's), equidistant or fisheye"
@@ -321,24 +326,22 @@ def _is_fisheye(path: str | Path, by_meaning: Found) -> bool:
     return any(models)
 
 
-def _all_zero(path: str | Path, by_meaning: Found) -> bool:
+def _has_zero_distortion(path: str | Path, entries: EntriesByMeaning) -> bool:
     """Whether coefficients are given and are all 0."""
-    are_given = not by_meaning.keys().isdisjoint(("distortion_coefficients", *ORDER, *TILT))
-    return are_given and not any(_coefficients(path, by_meaning, False))
+    has_coefficients = not entries.keys().isdisjoint(("distortion_coefficients", *ORDER, *TILT))
+    return has_coefficients and not any(_coefficients(path, entries, False))
 
 
-def _coefficients(path: str | Path, by_meaning: Found, fisheye: bool) -> list[float]:
+def _coefficients(path: str | Path, entries: EntriesByMeaning, fisheye: bool) -> list[float]:
     """The coefficients in OpenCV's order."""
-    by_name = {
-        name: _number(path, by_meaning, name) for name in (*ORDER, *TILT) if name in by_meaning
-    }
-    if "distortion_coefficients" not in by_meaning:
+    by_name = {name: _number(path, entries, name) for name in (*ORDER, *TILT) if name in entries}
+    if "distortion_coefficients" not in entries:
         order = ("k1", "k2", "k3", "k4") if fisheye else (*ORDER, *TILT)
-        unused = [name for name, value in by_name.items() if value and name not in order]
-        if unused:
-            raise InputError(f"{path}: {', '.join(unused)}: a fisheye has k1 to k4")
+        superfluous = [name for name, value in by_name.items() if value and name not in order]
+        if superfluous:
+            raise InputError(f"{path}: {', '.join(superfluous)}: a fisheye has k1 to k4")
         return [by_name.get(name, 0.0) for name in order]
-    name, value = by_meaning["distortion_coefficients"]
+    name, value = entries["distortion_coefficients"]
     values = matrix_of(path, name, value, None).tolist()
     if any(by_name.values()) and [by_name.get(k, 0.0) for k in ORDER[: len(values)]] != values:
         raise InputError(f"{path}: {name} and {', '.join(by_name)} differ; expected one of them")
@@ -351,26 +354,29 @@ def _coefficients(path: str | Path, by_meaning: Found, fisheye: bool) -> list[fl
     return values
 
 
-def _image_size(path: str | Path, by_meaning: Found) -> tuple[int, int] | None:
-    sides = [by_meaning.get(f"image_{n}", ("", None))[1] for n in ("width", "height")]
+def _image_size(path: str | Path, entries: EntriesByMeaning) -> tuple[int, int] | None:
+    sides = [entries.get(f"image_{n}", ("", None))[1] for n in ("width", "height")]
     if sides == [None, None]:
-        size = by_meaning.get("image_size", ("", None))[1]
+        size = entries.get("image_size", ("", None))[1]
         if size is None:
             return None
         if isinstance(size, Mapping):
-            by_own_name = {MEANING.get(fold(name)): value for name, value in size.items()}
-            size = [by_own_name.get("image_width"), by_own_name.get("image_height")]
-            size = by_meaning["image_size"][1]["data"] if size == [None, None] else size
+            by_meaning = {MEANING.get(fold(name)): value for name, value in size.items()}
+            size = [by_meaning.get("image_width"), by_meaning.get("image_height")]
+            size = entries["image_size"][1]["data"] if size == [None, None] else size
         size = size[0] if isinstance(size, list) and len(size) == 1 else size
         sides = size if isinstance(size, list) and len(size) == 2 else [None, None]
-    width, height = (_as_whole_number(x) for x in sides)
+    width, height = (_positive_integer(x) for x in sides)
     if width is None or height is None:
         raise InputError(f"{path}: the image size is {show(sides)}; two whole numbers expected")
     return width, height
 
 
 def _published_image(
-    path: str | Path, by_meaning: Found, core: dict[str, float], size: tuple[int, int] | None
+    path: str | Path,
+    entries: EntriesByMeaning,
+    core: dict[str, float],
+    size: tuple[int, int] | None,
 ) -> tuple[dict[str, float], tuple[int, int] | None, list[str]]:
     """The camera of the image that a camera of ROS publishes: a region of the whole one (`roi`),
     whose pixels are binned.
@@ -379,21 +385,21 @@ def _published_image(
 
     Source: ROS, sensor_msgs/CameraInfo; image_geometry, PinholeCameraModel::fromCameraInfo.
     """
-    name, roi = by_meaning.get("roi", ("", {}))
-    whole = {}
+    name, roi = entries.get("roi", ("", {}))
+    roi_values = {}
     for key, value in roi.items():
         if fold(key) in ("dorectify",):
             continue  # how it is displayed
         if fold(key) not in ("xoffset", "yoffset", "width", "height"):
             raise InputError(f"{path}: unknown key {show(key)} in {name}; expected x_offset, …")
         if value is not None:
-            whole[fold(key)] = _count(path, f"{name}: {key}", value)
-    x, y = whole.get("xoffset", 0), whole.get("yoffset", 0)
+            roi_values[fold(key)] = _natural_number(path, f"{name}: {key}", value)
+    x, y = roi_values.get("xoffset", 0), roi_values.get("yoffset", 0)
     bins = [
-        _count(path, *by_meaning[kind]) or 1 if kind in by_meaning else 1
+        _natural_number(path, *entries[kind]) or 1 if kind in entries else 1
         for kind in ("binning_x", "binning_y")
     ]
-    region = [whole.get(key, 0) for key in ("width", "height")]
+    region = [roi_values.get(key, 0) for key in ("width", "height")]
     messages = []
     if size is None and any((x, y, *region)):
         raise InputError(f"{path}: {name} needs the size of the whole image, which is missing")
@@ -420,16 +426,16 @@ def _published_image(
     return core, size, messages
 
 
-def _count(path: str | Path, name: str, value: object) -> int:
+def _natural_number(path: str | Path, name: str, value: object) -> int:
     if value == 0:
         return 0
-    number = _as_whole_number(value)
+    number = _positive_integer(value)
     if number is None:
         raise InputError(f"{path}: {name} is {show(value)}; expected a whole number")
     return number
 
 
-def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> FittedCamera:
+def _fit_nearest(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> FittedCamera:
     """The nearest of our cameras to one with a skew or a tilted sensor."""
     if camera.image_size is None:
         raise InputError(
@@ -437,9 +443,9 @@ def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> Fitt
             "the image size is needed: give image_width and image_height"
         )
     p = all_parameters(camera)
-    parameters = {"camera": p, "skew": skew, "H": _tilt(*tilt) if tilt else np.eye(3)}
-    has = [f"skew {skew:g}"] if skew else []
-    has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
+    parameters = {"camera": p, "skew": skew, "H": _tilt_homography(*tilt) if tilt else np.eye(3)}
+    features = [f"skew {skew:g}"] if skew else []
+    features += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
     foreign = Foreign(
         FORMULAS[str(camera.model)],
         parameters,
@@ -447,24 +453,26 @@ def _fit(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> Fitt
         camera.image_size,
         fisheye=camera.model != "opencv",
     )
-    return fit_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
+    return fit_camera(camera.id, foreign, str(path), f"has {' and '.join(features)}")
 
 
-def _image(name: str, p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
+def _project_ray(
+    name: str, p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar
+) -> Float[Array, "2"]:
     """Pixels of a ray in a camera with a skew and a tilted sensor."""
-    model, camera_parameters = get_model(name), p["camera"]
+    model, parameters = get_model(name), p["camera"]
     # The homography acts on [x'', y''] before fx, fy, cx, cy do: the model is asked without them.
-    plain = camera_parameters | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
-    xy = project(model, tuple(plain[key] for key in model.parameters), X, -Y, -Z)
+    unit_parameters = parameters | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    xy = project(model, tuple(unit_parameters[key] for key in model.parameters), X, -Y, -Z)
     x, y, s = p["H"] @ jnp.stack([*xy, 1.0])
-    u = camera_parameters["fx"] * x / s + p["skew"] * y / s + camera_parameters["cx"]
-    return jnp.stack([u, camera_parameters["fy"] * y / s + camera_parameters["cy"]])
+    u = parameters["fx"] * x / s + p["skew"] * y / s + parameters["cx"]
+    return jnp.stack([u, parameters["fy"] * y / s + parameters["cy"]])
 
 
-FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt", "mei")}
+FORMULAS = {name: partial(_project_ray, name) for name in ("opencv", "kannala-brandt", "mei")}
 
 
-def _tilt(tx: float, ty: float) -> Float[np.ndarray, "3 3"]:
+def _tilt_homography(tx: float, ty: float) -> Float[np.ndarray, "3 3"]:
     """The homography of a tilted sensor (the module's docstring)."""
     cx, sx, cy, sy = np.cos(tx), np.sin(tx), np.cos(ty), np.sin(ty)
     about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
@@ -479,38 +487,34 @@ def matrix_of(
 
     **Raises:** `InputError` naming file and entry."""
     if isinstance(value, Mapping):
-        stated_shape = tuple(_as_whole_number(value.get(key)) for key in ("rows", "cols"))
+        declared_shape = tuple(_positive_integer(value.get(key)) for key in ("rows", "cols"))
         data = value.get("data")
         # ROS writes a camera without distortion as 1 × 0 numbers, or none at all
         if data in (None, []) and 0 in (value.get("rows"), value.get("cols")):
-            data, stated_shape = [], (1, 0)
-        whole_numbers = [n for n in stated_shape if n is not None]
-        if (
-            len(whole_numbers) < 2
-            or not isinstance(data, list)
-            or len(data) != whole_numbers[0] * whole_numbers[1]
-        ):
+            data, declared_shape = [], (1, 0)
+        sides = [n for n in declared_shape if n is not None]
+        if len(sides) < 2 or not isinstance(data, list) or len(data) != sides[0] * sides[1]:
             size = len(data) if isinstance(data, list) else "no"
             raise InputError(
                 f"{path}: {name} has {size} numbers for {show(value.get('rows'))} rows and "
                 f"{show(value.get('cols'))} columns"
             )
     else:
-        data, stated_shape = value, None
+        data, declared_shape = value, None
         # [[…]], [[[…]]]: rows of a matrix, and of lists of lists of one
         while isinstance(data, list) and data and all(isinstance(row, list) for row in data):
             data = [x for row in data for x in row]
     if not isinstance(data, list) or not all(_is_number(x) for x in data):
         raise InputError(f"{path}: {name}: expected a list of finite numbers")
     if shape is not None and (
-        stated_shape not in (None, shape) or len(data) != shape[0] * shape[1]
+        declared_shape not in (None, shape) or len(data) != shape[0] * shape[1]
     ):
         raise InputError(f"{path}: {name} must have {shape[0]} rows and {shape[1]} columns")
     array = np.array(data, float)
     return array if shape is None else array.reshape(shape)
 
 
-def _as_whole_number(value: object) -> int | None:
+def _positive_integer(value: object) -> int | None:
     if not _is_number(value) or not float(value).is_integer() or not 0 < value < 1e9:
         return None
     return int(value)

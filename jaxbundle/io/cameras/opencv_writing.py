@@ -80,7 +80,7 @@ def ros_text(
     kind = "equidistant" if fisheye else "rational_polynomial" if rational else "plumb_bob"
     values = [p[name] for name in (names if fisheye or rational else names[:5])]
     K = [p["fx"], 0.0, p["cx"], 0.0, p["fy"], p["cy"], 0.0, 0.0, 1.0]
-    turn = np.eye(3) if R is None else R
+    rotation = np.eye(3) if R is None else R
     projection = np.c_[np.reshape(K, (3, 3)), np.zeros(3)] if P is None else P
     return _as_yaml(
         {
@@ -90,7 +90,7 @@ def ros_text(
             "camera_matrix": (3, 3, K),
             "distortion_model": kind,
             "distortion_coefficients": (1, len(values), values),
-            "rectification_matrix": (3, 3, turn.ravel()),
+            "rectification_matrix": (3, 3, rotation.ravel()),
             "projection_matrix": (3, 4, projection.ravel()),
         },
         ros=True,

@@ -46,7 +46,7 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
             raise InputError(f"{path}: was not solved; there is no camera in it")
         parts = document.get("calibrations", {"": document})
         return [
-            _calibrate(path, id, entry, part.get("calibration", {}))
+            _calibrated_camera(path, id, entry, part.get("calibration", {}))
             for part in parts.values()
             for id, entry in part["cameras"].items()
         ]
@@ -55,11 +55,11 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
     except ValueError as error:
         raise InputError(f"{path}: not a result in JSON: {str(error)[:100]}") from None
     except (KeyError, TypeError, AttributeError) as error:
-        fault = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
-        raise InputError(f"{path}: not the result of adjust or calibrate: {fault}") from None
+        problem = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{path}: not the result of adjust or calibrate: {problem}") from None
 
 
-def _calibrate(
+def _calibrated_camera(
     path: str | Path, id: str, entry: Mapping[str, Any], settings: Mapping[str, Any]
 ) -> Calibrated:
     """The camera of an entry of `cameras`; `settings`: those of its calibration, in the JSON."""
@@ -69,19 +69,21 @@ def _calibrate(
     sizes = {"image_size": settings.get("image_size"), **entry}
     row |= {name: sizes[name] for name in ("image_size", "pixel_size") if sizes.get(name)}
     (camera,) = make_cameras([row], f"{path}, ")
-    free = [name for name, p in parameters.items() if p["free"]]
+    free_names = [name for name, p in parameters.items() if p["free"]]
     # Both or none: σ and correlations of one covariance.
     kind = "_correlated" if "correlations_correlated" in entry else ""
-    sigma = np.array([float(parameters[name][f"sigma{kind}"]) for name in free])
+    sigma = np.array([float(parameters[name][f"sigma{kind}"]) for name in free_names])
     correlations = entry[f"correlations{kind}"]
     # The JSON has one row for a group of tied parameters: they are fully correlated, ρ = 1.
-    name_listed = {name: _find_tied(name, parameters, correlations) for name in free}
+    listed_name = {name: _find_tied(name, parameters, correlations) for name in free_names}
     correlation = lambda a, b: 1.0 if a == b else float(correlations[a][b])
-    R = np.array([[correlation(name_listed[a], name_listed[b]) for b in free] for a in free])
-    R = R.reshape(len(free), len(free))  # without free parameters [0, 0]
+    R = np.array(
+        [[correlation(listed_name[a], listed_name[b]) for b in free_names] for a in free_names]
+    )
+    R = R.reshape(len(free_names), len(free_names))  # without free parameters [0, 0]
     if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
         raise InputError(f"{path}, camera {id!r}: a σ or correlation is not a number")
-    return camera, (free, sigma[:, None] * R * sigma)  # Q = diag(σ)·R·diag(σ)
+    return camera, (free_names, sigma[:, None] * R * sigma)  # Q = diag(σ)·R·diag(σ)
 
 
 def _find_tied(
@@ -91,7 +93,7 @@ def _find_tied(
     fx and fy, with the same value and σ."""
     if name in correlations:
         return name
-    is_same = lambda other: all(
-        parameters[other][field] == parameters[name][field] for field in ("value", "sigma")
+    is_same = lambda candidate: all(
+        parameters[candidate][field] == parameters[name][field] for field in ("value", "sigma")
     )
-    return next((other for other in correlations if is_same(other)), name)
+    return next((candidate for candidate in correlations if is_same(candidate)), name)

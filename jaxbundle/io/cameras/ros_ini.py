@@ -30,7 +30,7 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import with_messages
 from jaxbundle.io.cameras.opencv_file import camera_of
-from jaxbundle.io.cameras.spellings import Found
+from jaxbundle.io.cameras.spellings import EntriesByMeaning
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.io.text.rows import TextRows
 from jaxbundle.network.tables import Camera
@@ -76,7 +76,7 @@ def read_ros_sections(path: Path) -> list[tuple[Camera, Section]]:
     **Raises:** `InputError` naming file and line.
     """
     unknown = UnknownKeys()
-    size: Found = {}
+    size: EntriesByMeaning = {}
     cameras: dict[str, tuple[Camera, Section]] = {}
     for name, section in _sections(path):
         if name == IMAGE:
@@ -89,7 +89,7 @@ def read_ros_sections(path: Path) -> list[tuple[Camera, Section]]:
                 size[f"image_{key}"] = key, values[0]
             continue
         unknown.check(section, KEYS, f"{path}, [{name}]")
-        by_meaning: Found = dict(size)
+        by_meaning: EntriesByMeaning = dict(size)
         for key, kind in zip(KEYS.used, ("camera_matrix", "distortion_coefficients")):
             if key not in section:
                 raise InputError(f"{path}, [{name}]: {key} is missing; expected it in a camera")

@@ -55,11 +55,11 @@ class Lens:
         return {**self.required, **self.optional}
 
 
-def _keys_in_section(section: str, **keys: str) -> dict[str, str]:
+def _keys_of_section(section: str, **keys: str) -> dict[str, str]:
     return {name: f"{section}.{key}" for name, key in keys.items()}
 
 
-def _same_names(section: str, names: str) -> dict[str, str]:
+def _names_in_section(section: str, names: str) -> dict[str, str]:
     return {name: f"{section}.{name}" for name in names.split()}
 
 
@@ -70,22 +70,28 @@ PROJECTION, DISTORTION, MIRROR = (
 )
 CAMODOCAL = {
     "PINHOLE": Lens(
-        "opencv", _same_names(PROJECTION, "fx fy cx cy"), _same_names(DISTORTION, "k1 k2 p1 p2 k3")
+        "opencv",
+        _names_in_section(PROJECTION, "fx fy cx cy"),
+        _names_in_section(DISTORTION, "k1 k2 p1 p2 k3"),
     ),
     "PINHOLE_FULL": Lens(
-        "opencv", _same_names(PROJECTION, "fx fy cx cy"), _same_names(DISTORTION, "k1 k2 p1 p2 k3 k4 k5 k6")
+        "opencv",
+        _names_in_section(PROJECTION, "fx fy cx cy"),
+        _names_in_section(DISTORTION, "k1 k2 p1 p2 k3 k4 k5 k6"),
     ),
     "KANNALA_BRANDT": Lens(
         "kannala-brandt",
-        _keys_in_section(PROJECTION, fx="mu", fy="mv", cx="u0", cy="v0", k1="k2", k2="k3", k3="k4", k4="k5"),
+        _keys_of_section(
+            PROJECTION, fx="mu", fy="mv", cx="u0", cy="v0", k1="k2", k2="k3", k3="k4", k4="k5"
+        ),
     ),
     "MEI": Lens(
         "mei",
         {
-            **_keys_in_section(MIRROR, xi="xi"),
-            **_keys_in_section(PROJECTION, fx="gamma1", fy="gamma2", cx="u0", cy="v0"),
+            **_keys_of_section(MIRROR, xi="xi"),
+            **_keys_of_section(PROJECTION, fx="gamma1", fy="gamma2", cx="u0", cy="v0"),
         },
-        _same_names(DISTORTION, "k1 k2 p1 p2"),
+        _names_in_section(DISTORTION, "k1 k2 p1 p2"),
     ),
 }
 SCARAMUZZA = "SCARAMUZZA"
@@ -203,8 +209,8 @@ def camodocal_camera(path: Path, fields: JsonFields) -> Camera:
     unknown.check(fields.document, CAMODOCAL_KEYS, path)
     for section in (PROJECTION, DISTORTION, MIRROR):
         if fields.get(section) is not None:
-            lens_keys = [key.partition(".")[2] for key in lens.keys.values() if section in key]
-            unknown.check(fields.child(section).document, Keys(lens_keys), f"{path}, {section}")
+            section_keys = [key.partition(".")[2] for key in lens.keys.values() if section in key]
+            unknown.check(fields.child(section).document, Keys(section_keys), f"{path}, {section}")
     parameters = {name: fields.number(key) for name, key in lens.required.items()}
     parameters |= {name: fields.number(key, 0.0) for name, key in lens.optional.items()}
     return _named_camera(path, fields, lens.model, parameters, unknown)
@@ -219,7 +225,7 @@ def _named_camera(
 ) -> Camera:
     name = fields.get("camera_name")
     id = str(name) if name not in (None, "", "camera") else path.stem
-    camera = Camera(id, model, parameters, image_size=_size(fields, *SIZE))
+    camera = Camera(id, model, parameters, image_size=_image_size(fields, *SIZE))
     check_camera(camera, f"{path}, ")
     return with_messages(camera, *unknown.messages())
 
@@ -247,10 +253,10 @@ def _scaramuzza(path: Path, fields: JsonFields) -> Camera:
 def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Camera]:
     """One camera of ORB-SLAM or two."""
     document = fields.document
-    types_given = [str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)]
+    stated_types = [str(document[k]) for k in ("Camera.type", "Camera.model") if document.get(k)]
     # Some files have the arrangement of the cameras as their type, and the lens as their model.
-    lenses = [text for text in types_given if text.lower() not in ARRANGEMENTS]
-    text = next(iter(lenses or types_given), "")
+    lenses = [text for text in stated_types if text.lower() not in ARRANGEMENTS]
+    text = next(iter(lenses or stated_types), "")
     kind = re.sub(r"[\W_]+", "", text).lower() or "pinhole"
     if document.get("Camera.bFishEye") and ORB_SLAM.get(kind, ("",))[0] != "kannala-brandt":
         raise InputError(f"{path}: Camera.bFishEye of ORB-SLAM without Camera.type KannalaBrandt8")
@@ -263,12 +269,12 @@ def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Ca
     prefixes = [p for p in (*PREFIXES, "Camera2") if f"{p}.fx" in document]
     if "Camera" in prefixes and "Camera1" in prefixes:
         raise InputError(f"{path}: Camera.fx and Camera1.fx; expected one of them")
-    orb_keys = [f"{p}.{name}" for p in prefixes for name in f"{CORE} {names}".split()]
-    unknown.check(document, ORB_KEYS | Keys(orb_keys), path)
+    camera_keys = [f"{p}.{name}" for p in prefixes for name in f"{CORE} {names}".split()]
+    unknown.check(document, ORB_KEYS | Keys(camera_keys), path)
     # A dot leads into an object; these keys have dots themselves.
     raw = JsonFields(path, {key.replace(".", " "): value for key, value in document.items()})
     sides = [("Camera width", "Camera height"), ("Camera cols", "Camera rows")]
-    size = next((s for w, h in sides if (s := _size(raw, w, h))), None)
+    size = next((s for w, h in sides if (s := _image_size(raw, w, h))), None)
     cameras = []
     for prefix in prefixes:
         parameters = {name: raw.number(f"{prefix} {name}") for name in CORE.split()}
@@ -286,10 +292,10 @@ def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Ca
     return cameras
 
 
-def _size(fields: JsonFields, width: str, height: str) -> tuple[int, int] | None:
+def _image_size(fields: JsonFields, width: str, height: str) -> tuple[int, int] | None:
     if fields.get(width) is None and fields.get(height) is None:
         return None
-    return fields.integer(width, least=1), fields.integer(height, least=1)
+    return fields.integer(width, minimum=1), fields.integer(height, minimum=1)
 
 
 def read_yaml_fields(path: Path) -> JsonFields:

@@ -22,7 +22,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 
 # The entries of a camera by meaning: the spelling in the file, and the value.
-Found = dict[str, tuple[str, Any]]
+EntriesByMeaning = dict[str, tuple[str, Any]]
 
 CORE: tuple[str, ...] = ("fx", "fy", "cx", "cy")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
@@ -69,7 +69,7 @@ MODEL_NAMES = {
 }
 """Our model by the names that files give to OpenCV's two."""
 # Entries of such files that do not concern the image of a ray, by meaning.
-LEFT = Keys(
+IGNORED = Keys(
     (),
     {
         **dict.fromkeys(
@@ -138,14 +138,14 @@ def meaning_of(name: str, value: Any) -> str | None:
 
 
 def camera_entries(
-    entries: Mapping[str, Any], where: object, unknown: UnknownKeys, ignored: Keys = LEFT
-) -> Found:
+    entries: Mapping[str, Any], where: object, unknown: UnknownKeys, ignored: Keys = IGNORED
+) -> EntriesByMeaning:
     """The entries of a camera by meaning; others are checked by the rule of keys.
 
     **Raises:** `InputError` for an unknown entry that may change the geometry, and for two entries
     of one meaning."""
-    by_meaning: Found = {}
-    other_names = []
+    by_meaning: EntriesByMeaning = {}
+    unrecognised = []
     for name, value in entries.items():
         kind = meaning_of(name, value)
         # What is null, or an empty list, says nothing.
@@ -154,17 +154,17 @@ def camera_entries(
         if kind == "distortion_coefficients" and isinstance(value, str):
             kind = "distortion_model"
         if kind is None:
-            other_names.append(name)
-        elif kind in ("camera_matrix", "distortion_coefficients") and _is_named(value):
-            nested = camera_entries(value, where, unknown, ignored)
-            if kind == "distortion_coefficients" and nested.keys().isdisjoint(
+            unrecognised.append(name)
+        elif kind in ("camera_matrix", "distortion_coefficients") and _has_named_numbers(value):
+            inner_entries = camera_entries(value, where, unknown, ignored)
+            if kind == "distortion_coefficients" and inner_entries.keys().isdisjoint(
                 (kind, *COEFFICIENTS, *TILT)
             ):
                 raise InputError(
                     f"{where}: {name} is {show(value)}; expected the coefficients of distortion"
                 )
-            for meaning, (spelled, part) in nested.items():
-                _add_entry(by_meaning, meaning, (f"{name}.{spelled}", part), where)
+            for meaning, (spelling, part) in inner_entries.items():
+                _add_entry(by_meaning, meaning, (f"{name}.{spelling}", part), where)
         else:
             _add_entry(by_meaning, kind, (name, value), where)
     if "roi" in by_meaning and not isinstance(by_meaning["roi"][1], Mapping):
@@ -172,33 +172,35 @@ def camera_entries(
         if not any("new" in fold(name) or "optimal" in fold(name) for name in entries):
             raise InputError(
                 f"{where}: {by_meaning['roi'][0]} is {show(by_meaning['roi'][1])}; expected "
-                "x_offset, "
-                "y_offset, width and height, as in ROS; without it if the image is whole"
+                "x_offset, y_offset, width and height, as in ROS; without it if the image is whole"
             )
         del by_meaning["roi"]
-    folded = {fold(name): name for name in other_names}
-    if "xi" in by_meaning and (sphere := [name for key, name in folded.items() if key == "alpha"]):
+    name_by_folded = {fold(name): name for name in unrecognised}
+    if "xi" in by_meaning and (
+        sphere := [name for key, name in name_by_folded.items() if key == "alpha"]
+    ):
         raise InputError(
             f"{where}: {by_meaning['xi'][0]} and {sphere[0]} are a double sphere, not a camera of "
             "OpenCV; expected a Kalibr file, camera_model ds"
         )
-    for name in ignored.unknown(folded):
-        unknown.check([folded[name]], Keys((*CORE, *SPELLINGS)), where)
+    for name in ignored.unknown(name_by_folded):
+        unknown.check([name_by_folded[name]], Keys((*CORE, *SPELLINGS)), where)
     return by_meaning
 
 
-def _add_entry(by_meaning: Found, kind: str, entry: tuple[str, Any], where: object) -> None:
+def _add_entry(
+    by_meaning: EntriesByMeaning, kind: str, entry: tuple[str, Any], where: object
+) -> None:
     # Of several names, the first: none of them concerns rays.
     if kind != "camera_name" and kind in by_meaning and by_meaning[kind][1] != entry[1]:
         raise InputError(
             f"{where}: {by_meaning[kind][0]} and {entry[0]} are both the "
-            f"{kind.replace('_', ' ')}, and "
-            "differ; expected one of them"
+            f"{kind.replace('_', ' ')}, and differ; expected one of them"
         )
     by_meaning.setdefault(kind, entry)
 
 
-def _is_named(value: Any) -> TypeGuard[Mapping[str, Any]]:
+def _has_named_numbers(value: Any) -> TypeGuard[Mapping[str, Any]]:
     """Whether a value is numbers by their names, not a matrix of OpenCV."""
     return isinstance(value, Mapping) and not {"rows", "data"} <= value.keys()
 
@@ -212,11 +214,11 @@ def is_matrix(value: Any) -> bool:
     if isinstance(value, Mapping):
         meanings = {MEANING.get(fold(name)) for name in value}
         return {"rows", "data"} <= value.keys() or {"fx", "fy"} <= meanings
-    flat = _flat(value)
+    flat = _flatten(value)
     return len(flat) in (4, 9) and all(map(_is_scalar, flat))
 
 
-def _flat(value: Any) -> list[Any]:
+def _flatten(value: Any) -> list[Any]:
     """The numbers of lists of lists; not the elements of a long list."""
     if not isinstance(value, list) or len(value) > 16:
         return [value]
@@ -228,8 +230,8 @@ def has_camera(entries: Any) -> bool:
     if not isinstance(entries, Mapping):
         return False
     kinds = {meaning_of(name, value): value for name, value in entries.items()}
-    has_lengths = {"fx", "fy"} <= kinds.keys()
-    return has_lengths or is_matrix(kinds.get("camera_matrix"))
+    has_focal_lengths = {"fx", "fy"} <= kinds.keys()
+    return has_focal_lengths or is_matrix(kinds.get("camera_matrix"))
 
 
 def cameras_within(

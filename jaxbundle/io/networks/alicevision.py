@@ -137,22 +137,26 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         unknown.check(row.document, VIEW_KEYS, row.path)
         if row.text("intrinsicId", "none") in cameras:
             views[row.text("viewId")] = row
-    tie, colours, rays = _structure(file, unknown, views)
-    seen_views = {view for view, *_ in rays}
-    posed = {id for id, row in views.items() if row.text("poseId", "none") in poses}
-    left_out = [Path(_path(views[id], id)).name for id in views if id not in posed | seen_views]
-    views = {id: row for id, row in views.items() if id in posed | seen_views}
+    tie_points, colours, rays = _structure(file, unknown, views)
+    measured_views = {view for view, *_ in rays}
+    posed_views = {id for id, row in views.items() if row.text("poseId", "none") in poses}
+    omitted_views = [
+        Path(_photograph_path(views[id], id)).name
+        for id in views
+        if id not in posed_views | measured_views
+    ]
+    views = {id: row for id, row in views.items() if id in posed_views | measured_views}
     if not views:
         raise InputError(
             f"{path}: a scene of AliceVision without poses and image points; expected the result "
             "of its structure from motion"
         )
-    files = [re.split(r"[\\/]", _path(row, id))[-1] for id, row in views.items()]
+    files = [re.split(r"[\\/]", _photograph_path(row, id))[-1] for id, row in views.items()]
     labels = unique_labels(files, list(views))
     names = dict(zip(views, labels))
     R, X0 = np.full((len(views), 3, 3), np.nan), np.full((len(views), 3), np.nan)
     for k, (id, row) in enumerate(views.items()):
-        if id in posed:
+        if id in posed_views:
             pose = poses[row.text("poseId")]
             R[k] = _numbers(pose, "rotation", 9).reshape(3, 3).T
             X0[k] = _numbers(pose, "center", 3)
@@ -164,15 +168,17 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         flip_rows(R),
         X0,
     )
-    place = lambda k: (f"{path}, structure[{k}]", "X")
-    X = stack_rows([_plain(value) for value in tie.values()], 3, place).reshape(-1, 3)
-    place = lambda k: (f"{path}, structure[{k}]", "color")
-    rgb = stack_rows([_plain(value) for value in colours], 3, place).reshape(-1, 3)
-    place = lambda k: (f"{path}, landmark {rays[k][1]}, view {rays[k][0]}", "x")
-    xy = stack_rows([_plain(x) for *_, x in rays], 2, place).reshape(-1, 2)
+    location_of = lambda k: (f"{path}, structure[{k}]", "X")
+    X = stack_rows(
+        [_parse_numbers(value) for value in tie_points.values()], 3, location_of
+    ).reshape(-1, 3)
+    location_of = lambda k: (f"{path}, structure[{k}]", "color")
+    rgb = stack_rows([_parse_numbers(value) for value in colours], 3, location_of).reshape(-1, 3)
+    location_of = lambda k: (f"{path}, landmark {rays[k][1]}, view {rays[k][0]}", "x")
+    xy = stack_rows([_parse_numbers(x) for *_, x in rays], 2, location_of).reshape(-1, 2)
     messages = [
-        f"left out {count(len(left_out), 'view')} without pose and image points: "
-        f"{list_some(left_out)}"
+        f"left out {count(len(omitted_views), 'view')} without pose and image points: "
+        f"{list_some(omitted_views)}"
     ]
     return assemble(
         path,
@@ -180,7 +186,7 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         overrides,
         images,
         Columns(
-            {"id": list(tie), **dict(zip("XYZ", X.T)), **colour_columns(rgb)},
+            {"id": list(tie_points), **dict(zip("XYZ", X.T)), **colour_columns(rgb)},
             Source(str(path), None, "landmark"),
         ),
         Columns(
@@ -191,7 +197,7 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
             },
             Source(str(path), None, "observation"),
         ),
-        (*(messages if left_out else ()), *unknown.messages()),
+        (*(messages if omitted_views else ()), *unknown.messages()),
     )
 
 
@@ -252,7 +258,7 @@ def _camera(row: JsonFields, id: str, version: tuple[int, ...]) -> dict[str, Any
     }
 
 
-def _path(view: JsonFields, id: str) -> str:
+def _photograph_path(view: JsonFields, id: str) -> str:
     """The path of a photograph, or the number of its view."""
     return str(view.get("path") or id)
 
@@ -261,20 +267,20 @@ def _structure(
     file: JsonFields, unknown: UnknownKeys, views: Mapping[str, JsonFields]
 ) -> tuple[dict[str, Any], list[Any], list[tuple[str, str, Any]]]:
     """X of the landmarks; their colours; view, landmark, x of the image points."""
-    tie, colours, rays = {}, {}, []
+    tie_points, colours, rays = {}, {}, []
     for row in file.rows("structure"):
         unknown.check(row.document, POINT_KEYS, row.path)
         id = row.text("landmarkId")
-        tie[id], colours[id] = row.get("X"), row.get("color", GREY)
+        tie_points[id], colours[id] = row.get("X"), row.get("color", GREY)
         for ray in row.rows("observations"):
             unknown.check(ray.document, RAY_KEYS, ray.path)
             view = ray.text("observationId")
             if view in views and ray.get("x") is not None:
                 rays.append((view, id, ray.get("x")))
-    return tie, [*colours.values()], rays
+    return tie_points, [*colours.values()], rays
 
 
-def _plain(value: Any) -> Any:
+def _parse_numbers(value: Any) -> Any:
     """Numbers that stand there as texts."""
     try:
         return [float(x) for x in value]
@@ -284,7 +290,7 @@ def _plain(value: Any) -> Any:
 
 def _numbers(fields: JsonFields, key: str, length: int | None) -> np.ndarray:
     value = fields.get(key)
-    return JsonFields(fields.path, {key: _plain(value)}).array(key, (length,))
+    return JsonFields(fields.path, {key: _parse_numbers(value)}).array(key, (length,))
 
 
 def _number(fields: JsonFields, key: str, default: float | None = None) -> float:

@@ -46,10 +46,10 @@ def write_alicevision(network: Network, path: str | Path) -> tuple[str, ...]:
         # By columns.
         transform = {"rotation": _texts(R[i].T.ravel()), "center": _texts(images.position[i])}
         poses.append({"poseId": str(i), "pose": {"transform": transform | {"locked": "0"}}})
-    observations_of_point: list[list[dict]] = [[] for _ in points.id]
+    point_observations: list[list[dict]] = [[] for _ in points.id]
     features = np.zeros(len(images), int)
     for i, p, xy in zip(rays.image.tolist(), rays.point.tolist(), rays.xy):
-        observations_of_point[p].append(
+        point_observations[p].append(
             {"observationId": str(i), "featureId": str(features[i]), "x": _texts(xy)}
         )
         features[i] += 1
@@ -64,7 +64,7 @@ def write_alicevision(network: Network, path: str | Path) -> tuple[str, ...]:
             "observations": observations,
         }
         for number, colour, X, observations in zip(
-            landmarks, colours, points.position, observations_of_point
+            landmarks, colours, points.position, point_observations
         )
     ]
     scene = {

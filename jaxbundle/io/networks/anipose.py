@@ -96,11 +96,11 @@ def read_anipose(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 def _camera(id: str, fields: JsonFields) -> Camera:
     K = fields.array("matrix", (3, 3))
-    for row, column, wanted in ((0, 1, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
-        if K[row, column] != wanted:
+    for row, column, expected in ((0, 1, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
+        if K[row, column] != expected:
             raise InputError(
                 f"{fields.path}: matrix has {K[row, column]:g} in row {row + 1}, column "
-                f"{column + 1}; expected {wanted}"
+                f"{column + 1}; expected {expected}"
             )
     if fields.get("rotation_count") not in (None, 0):
         raise InputError(
@@ -110,18 +110,20 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     fisheye = bool(fields.get("fisheye") or False)
     number = len(fields.get("distortions") or ())
     if number not in ((4,) if fisheye else LENGTHS):
-        expected = "4" if fisheye else "none, 4, 5 or 8"
-        raise InputError(f"{fields.path}: distortions has {number} numbers; expected {expected}")
+        expected_count = "4" if fisheye else "none, 4, 5 or 8"
+        raise InputError(
+            f"{fields.path}: distortions has {number} numbers; expected {expected_count}"
+        )
     values = fields.array("distortions", (number,)) if number else np.zeros(0)
-    distortion = dict(zip(EQUI if fisheye else OPENCV, values.tolist()))
+    coefficients = dict(zip(EQUI if fisheye else OPENCV, values.tolist()))
     core = dict(zip(CORE, (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
     w, h = fields.array("size", (2,))
     size = JsonFields(f"{fields.path}: size", {"w": w, "h": h})
     return Camera(
         id,
         "kannala-brandt" if fisheye else "opencv",
-        {name: float(value) for name, value in (core | distortion).items()},
-        image_size=(size.integer("w", least=1), size.integer("h", least=1)),
+        {name: float(value) for name, value in (core | coefficients).items()},
+        image_size=(size.integer("w", minimum=1), size.integer("h", minimum=1)),
     )
 
 
@@ -143,14 +145,14 @@ def write_anipose(network: Network, path: str | Path) -> tuple[str, ...]:
     mountings, losses = mountings_of(network), []
     if mountings is None and len(network.cameras) > 1:
         losses.append("mountings of the cameras")
-    document, place = {}, np.eye(4)
+    document, pose = {}, np.eye(4)
     for k, camera in enumerate(network.cameras):
         if mountings is not None and k:
-            place = mountings[k - 1] @ place
+            pose = mountings[k - 1] @ pose
         section = _camera_section(camera)
         if mountings is not None or len(network.cameras) == 1:
-            section["rotation"] = rotation_vectors_of(place[None, :3, :3])[0].tolist()
-            section["translation"] = place[:3, 3].tolist()
+            section["rotation"] = rotation_vectors_of(pose[None, :3, :3])[0].tolist()
+            section["translation"] = pose[:3, 3].tolist()
         document[f"cam_{k}"] = section
     write_text(Path(path), toml_text(document | {"metadata": {"adjusted": True}}))
     return (*describe_losses(network, ANIPOSE_LOSSES), *losses)

@@ -104,7 +104,7 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
     check_unique(ids, images.source, "image")
     index = {camera.id: c for c, camera in enumerate(cameras)}
     exterior = np.stack([images.numbers(name) for name in EXTERIOR], 1)
-    no_rows = np.zeros(0, np.int64)
+    no_indices = np.zeros(0, np.int64)
     # These settings concern observations and points, of which there are none.
     unused = ("sigma_image", "sigma_origin", "datum_points")
     settings = {k: v for k, v in project.items() if k not in unused}
@@ -119,7 +119,7 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
             images.source,
         ),
         points=Points((), (), np.zeros((0, 3)), np.zeros((0, 3))),
-        observations=Observations(no_rows, no_rows, np.zeros((0, 2)), np.zeros((0, 2))),
+        observations=Observations(no_indices, no_indices, np.zeros((0, 2)), np.zeros((0, 2))),
         **settings,
     )
 
@@ -152,19 +152,19 @@ def rig_network(
     """
     names = [camera.id for camera in cameras]
     M, X0 = exterior_from_cv(np.stack(R), np.stack(t))
-    is_placed = np.asarray(np.isfinite(np.concatenate([X0, M.reshape(-1, 9)], 1)).all(axis=1))
-    if is_placed.sum() < 2 and len(names) > 1:
+    has_pose = np.asarray(np.isfinite(np.concatenate([X0, M.reshape(-1, 9)], 1)).all(axis=1))
+    if has_pose.sum() < 2 and len(names) > 1:
         # A pose relative to nothing.
-        is_placed[:] = False
-    M[~is_placed], X0[~is_placed] = np.nan, np.nan
-    unplaced = [name for name, is_there in zip(names, is_placed) if not is_there]
-    if unplaced and len(names) > 1:
+        has_pose[:] = False
+    M[~has_pose], X0[~has_pose] = np.nan, np.nan
+    unposed = [name for name, is_posed in zip(names, has_pose) if not is_posed]
+    if unposed and len(names) > 1:
         description = (
-            f"{count(len(unplaced), 'camera')} without a pose relative to another in the file"
+            f"{count(len(unposed), 'camera')} without a pose relative to another in the file"
         )
         warnings = (
             *warnings,
-            f"{path}: {description}, left without orientation: {list_some(unplaced)}",
+            f"{path}: {description}, left without orientation: {list_some(unposed)}",
         )
     source = Source(str(path), None, "camera")
     network = assemble(
@@ -174,14 +174,10 @@ def rig_network(
         image_columns(source, names, names, M, X0),
         warnings=warnings,
     )
-    placed_names = [name for name, is_there in zip(names, is_placed) if is_there]
-    if len(placed_names) < 2:
+    mounted = [name for name, is_posed in zip(names, has_pose) if is_posed]
+    if len(mounted) < 2:
         return network
-    columns = {
-        "rig": [RIG] * len(placed_names),
-        "epoch": [MOMENT] * len(placed_names),
-        "image": placed_names,
-    }
+    columns = {"rig": [RIG] * len(mounted), "epoch": [MOMENT] * len(mounted), "image": mounted}
     return network.replace(further=(Rigs.from_columns(Columns(columns, source), {}, 1.0),))
 
 

@@ -67,16 +67,16 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     (cameras, points, rows), numbers = _numbers(path)
-    observed, numbers = np.split(numbers, [4 * rows])
+    observations, numbers = np.split(numbers, [4 * rows])
     poses, position = np.split(numbers, [9 * cameras])
-    observed, poses = observed.reshape(-1, 4), poses.reshape(-1, 9)
-    for column, count, noun in ((0, cameras, "camera"), (1, points, "point")):
-        index = observed[:, column]
-        wrong = (index < 0) | (index >= count) | (index % 1 != 0)
-        if wrong.any():
-            row = int(wrong.argmax())
+    observations, poses = observations.reshape(-1, 4), poses.reshape(-1, 9)
+    for column, count, name in ((0, cameras, "camera"), (1, points, "point")):
+        index = observations[:, column]
+        is_invalid = (index < 0) | (index >= count) | (index % 1 != 0)
+        if is_invalid.any():
+            row = int(is_invalid.argmax())
             raise InputError(
-                f"{path}, line {row + 2}: {noun} {index[row]:g} does not exist; the first line "
+                f"{path}, line {row + 2}: {name} {index[row]:g} does not exist; the first line "
                 f"announces {count}, counted from 0"
             )
     camera_entries = [
@@ -106,10 +106,10 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ),
         Columns(
             {
-                "image": observed[:, 0].astype(np.int64),
-                "point": observed[:, 1].astype(np.int64),
-                "x": observed[:, 2],
-                "y": observed[:, 3],
+                "image": observations[:, 0].astype(np.int64),
+                "point": observations[:, 1].astype(np.int64),
+                "x": observations[:, 2],
+                "y": observations[:, 3],
             },
             Source(str(path), np.arange(rows) + 2, "line"),
         ),
@@ -181,8 +181,7 @@ def _counts(path: Path, first_words: Sequence[bytes]) -> tuple[int, ...]:
     if max(map(len, first_words)) > 18:
         raise InputError(
             f"{path}, line 1: {b' '.join(first_words)[:60].decode()}: more cameras, points, "
-            "observations "
-            "than a file can hold"
+            "observations than a file can hold"
         )
     return tuple(map(int, first_words))
 
@@ -201,22 +200,21 @@ def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
             size = path.stat().st_size
             unpacked_size = largest_unpacked_size(size) if suffix in OPENERS else size
             # A number of 64 bits has 24 characters at most; 64 leave room for blanks around it.
-            max_bytes = min(64 * (expected + 1), unpacked_size)
-            text = file.read(max_bytes + 1)
+            limit = min(64 * (expected + 1), unpacked_size)
+            text = file.read(limit + 1)
     except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
     # A file that goes on is read no further.
-    if len(text) > max_bytes:
+    if len(text) > limit:
         raise InputError(
-            f"{path}: holds more than {max_bytes} characters, too many for the {expected} numbers "
-            "that "
+            f"{path}: holds more than {limit} characters, too many for the {expected} numbers that "
             f"line 1 announces, in a file of {size} bytes"
         )
     try:
         # Without a list of words, which would take several times the memory of the numbers.
         numbers = parse_numbers(text.decode("ascii"))
     except ValueError:
-        raise _not_a_number(path, text) from None
+        raise _number_error(path, text) from None
     if len(numbers) != expected:
         raise InputError(
             f"{path}: {len(numbers)} numbers follow the first line; expected {expected} "
@@ -225,19 +223,19 @@ def _numbers(path: Path) -> tuple[tuple[int, ...], Float[np.ndarray, " n"]]:
         )
     finite = np.isfinite(numbers)
     if not finite.all():
-        raise _not_a_number(path, text)
+        raise _number_error(path, text)
     return counts, numbers
 
 
-def _not_a_number(path: Path, text: bytes) -> InputError:
+def _number_error(path: Path, text: bytes) -> InputError:
     for line, row in enumerate(text.splitlines(), 2):
         for word in row.split():
             # float() reads 1_0 as ten, NumPy does not
             try:
-                good = np.isfinite(float(word)) and b"_" not in word
+                is_valid = np.isfinite(float(word)) and b"_" not in word
             except ValueError:
-                good = False
-            if not good:
+                is_valid = False
+            if not is_valid:
                 word = word.decode(errors="replace")
                 return InputError(f"{path}, line {line}: {show(word)} where a number is expected")
     return InputError(f"{path}: there is something other than numbers")

@@ -66,23 +66,23 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         if name not in files:
             raise InputError(f"{folder}: there is no {name} in it")
     photos, rays = _image_coordinates(files[IMAGE])
-    cameras, points, skipped = _geo_input(files[GEO])
-    camera_of_photo = [_find_camera(*photo, cameras, files[GEO]) for photo in photos]
-    unknown = np.full(len(photos), np.nan)
+    cameras, points, skipped_statements = _geo_input(files[GEO])
+    camera_ids = [_find_camera(*photo, cameras, files[GEO]) for photo in photos]
+    no_values = np.full(len(photos), np.nan)
     lines = np.array([row.number for *_, row in photos])
     images = Columns(
         {
             "id": [photo for photo, *_ in photos],
-            "camera": camera_of_photo,
-            **dict.fromkeys(EXTERIOR, unknown),
+            "camera": camera_ids,
+            **dict.fromkeys(EXTERIOR, no_values),
         },
         Source(str(files[IMAGE]), lines, "line"),
     )
     ids = dict.fromkeys(rays.values["point"])
-    known_points = {row["id"]: row for row in points}
+    points_by_id = {row["id"]: row for row in points}
     # New points are only in image.dat: tie points, without start values.
-    tie_points = [{"id": id, "role": "tie"} for id in ids if id not in known_points]
-    table = [*(row for row in points if row["id"] in ids), *tie_points]
+    tie_rows = [{"id": id, "role": "tie"} for id in ids if id not in points_by_id]
+    table = [*(row for row in points if row["id"] in ids), *tie_rows]
     network = assemble(
         folder,
         foreign_document(
@@ -104,10 +104,10 @@ def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     unseen = [row["id"] for row in points if row["id"] not in ids]
     if unseen:
         network = network.note(f"no photograph shows the points {list_some(unseen)}: left out")
-    if skipped:
+    if skipped_statements:
         network = network.warn(
-            f"{', '.join(skipped)} of {files[GEO].name} are not read: the distortion starts at 0; "
-            "give its parameters with --set camera.ID.p25=… and free=…"
+            f"{', '.join(skipped_statements)} of {files[GEO].name} are not read: the distortion "
+            "starts at 0; give its parameters with --set camera.ID.p25=… and free=…"
         )
     return network.note(
         "photographs and new points have no start values: the file with them (itera.dat) is not "
@@ -122,9 +122,9 @@ def _find_camera(
     if camera is None and len(cameras) == 1:
         return next(iter(cameras))
     if camera is None or camera not in cameras:
-        subject = f"camera {camera!r}" if camera else "no camera is named, and there are several"
+        problem = f"camera {camera!r}" if camera else "no camera is named, and there are several"
         raise row.error(
-            f"photograph {photo}: {subject}; CAPA statements in {file}: {', '.join(cameras)}"
+            f"photograph {photo}: {problem}; CAPA statements in {file}: {', '.join(cameras)}"
         )
     return camera
 
@@ -133,17 +133,17 @@ def _image_coordinates(path: Path) -> tuple[list[tuple[str, str | None, TextRow]
     """Photographs (id, camera or None, line) and the table of image points."""
     photos: list[tuple[str, str | None, TextRow]] = []
     images, points, values, lines = [], [], [], []
-    begun = False  # −99 ends a photograph, after which a point has none
+    in_photograph = False  # −99 ends a photograph, after which a point has none
     for row in TextRows(path, "#"):
         if _is_comment(row):
             continue
         if row.words[0] == END_OF_PHOTOGRAPH:
-            begun = False
+            in_photograph = False
         elif len(row) <= 2:
             photos.append((row.words[0], row.words[1] if len(row) == 2 else None, row))
-            begun = True
+            in_photograph = True
         else:
-            if not begun:
+            if not in_photograph:
                 raise row.error(
                     f"{len(row)} values where a photograph (PHOTO [CAMERA]) is expected"
                 )
@@ -161,13 +161,13 @@ def _image_coordinates(path: Path) -> tuple[list[tuple[str, str | None, TextRow]
 def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]], list[str]]:
     """Cameras by name, rows of points, and the skipped statements."""
     cameras: dict[str, dict] = {}
-    points, skipped = [], {}
+    points, skipped_statements = [], {}
     for row in TextRows(path, "#"):
         if _is_comment(row):
             continue
         keyword = row.words[0].upper()
         if keyword in SKIPPED_STATEMENTS:
-            skipped[keyword] = True
+            skipped_statements[keyword] = True
         elif keyword == "CAPA":
             camera = _camera(row)
             if camera["id"] in cameras:
@@ -195,14 +195,14 @@ def _geo_input(path: Path) -> tuple[dict[str, dict[str, Any]], list[dict[str, An
             )
     if not cameras:
         raise InputError(f"{path}: no camera (CAPA key CAMERA c xH yH)")
-    return cameras, points, list(skipped)
+    return cameras, points, list(skipped_statements)
 
 
 def _camera(row: TextRow) -> dict[str, Any]:
     key = row.integer(1, "the key of CAPA")
     if len(row) not in (6, 9):
         raise row.error("expected CAPA key CAMERA c xH yH [σc σx σy]")
-    values = row.numbers(INTERIOR, 3, more=True).tolist()
+    values = row.numbers(INTERIOR, 3, allow_more=True).tolist()
     camera = {"id": row.words[2], "model": "bingo", **dict(zip(INTERIOR, values))}
     if key == 3:  # all three are adjusted; other keys: none
         camera["free"] = list(INTERIOR)

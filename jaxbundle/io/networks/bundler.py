@@ -71,25 +71,26 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if " ".join(head.words) != HEAD:
         raise head.error(f"expected {HEAD!r}; other versions are not known")
     counts = rows.take("the numbers of cameras and points")
-    cameras, points = (counts.integer(k, noun) for k, noun in ((0, "cameras"), (1, "points")))
-    interior, R, t, places = _cameras(rows, cameras)
+    cameras, points = (counts.integer(k, name) for k, name in ((0, "cameras"), (1, "points")))
+    interior, R, t, camera_lines = _cameras(rows, cameras)
     oriented = np.flatnonzero(interior[:, 0] != 0) if cameras else np.zeros(0, int)
     if not len(oriented):
         raise InputError(f"{path}: no camera is oriented")
-    names = _names(path.parent / LIST, cameras)
-    position, colours, lines, observed = _points(rows, points, cameras)
-    if rows.more():
+    names = _image_names(path.parent / LIST, cameras)
+    position, colours, lines, rays = _points(rows, points, cameras)
+    if rows.has_more():
         raise rows.take("").error(f"a line after the last of {points} points")
-    image = observed[:, 0].astype(np.int64)
-    good = np.isin(image, oriented)
-    left_out = [names[i] for i in np.setdiff1d(np.arange(cameras), oriented)]
+    image = rays[:, 0].astype(np.int64)
+    in_oriented = np.isin(image, oriented)
+    unoriented_names = [names[i] for i in np.setdiff1d(np.arange(cameras), oriented)]
     warnings = [
-        f"left out {count(len(left_out), 'image')} that have no orientation: {list_some(left_out)}"
+        f"left out {count(len(unoriented_names), 'image')} that have no orientation: "
+        f"{list_some(unoriented_names)}"
     ]
     M, X0 = exterior_from_bundler(R[oriented], t[oriented])
     oriented_names = [names[i] for i in oriented]
     images = image_columns(
-        Source(str(path), places[oriented], "line"), oriented_names, oriented_names, M, X0
+        Source(str(path), camera_lines[oriented], "line"), oriented_names, oriented_names, M, X0
     )
     ids = np.arange(points)
     return assemble(
@@ -109,14 +110,14 @@ def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ),
         Columns(
             {
-                "image": [names[i] for i in image[good]],
-                "point": observed[good, 1].astype(np.int64),
-                "x": observed[good, 2],
-                "y": observed[good, 3],
+                "image": [names[i] for i in image[in_oriented]],
+                "point": rays[in_oriented, 1].astype(np.int64),
+                "x": rays[in_oriented, 2],
+                "y": rays[in_oriented, 3],
             },
-            Source(str(path), observed[good, 4].astype(np.int64), "line"),
+            Source(str(path), rays[in_oriented, 4].astype(np.int64), "line"),
         ),
-        warnings if left_out else (),
+        warnings if unoriented_names else (),
     )
 
 
@@ -131,15 +132,15 @@ def _cameras(
     """f, k1, k2; R; t; and lines, of all cameras."""
     interior, R, t, lines = [], [], [], []
     for k in range(number):
-        noun = f"camera {k} of {number}"
-        row = rows.take(f"f, k1, k2 of {noun}")
+        camera_name = f"camera {k} of {number}"
+        row = rows.take(f"f, k1, k2 of {camera_name}")
         interior.append(row.numbers(FREE))
         lines.append(row.number)
-        matrix = [rows.take(f"R of {noun}").numbers(["R"] * 3) for _ in range(3)]
+        matrix = [rows.take(f"R of {camera_name}").numbers(["R"] * 3) for _ in range(3)]
         R.append(np.array(matrix))
-        t.append(rows.take(f"t of {noun}").numbers(["t"] * 3))
+        t.append(rows.take(f"t of {camera_name}").numbers(["t"] * 3))
         if interior[-1][0] != 0:  # an image that was not oriented has f = 0 and R = 0
-            check_rotations(R[-1], f"{row.place}: R of {noun}")
+            check_rotations(R[-1], f"{row.location}: R of {camera_name}")
     return (
         np.array(interior).reshape(-1, 3),
         np.array(R).reshape(-1, 3, 3),
@@ -159,17 +160,17 @@ def _points(
     """Coordinates; colours; lines; and (camera, point, x, y, line) of all rays."""
     position, colours, lines, rays = [], [], [], []
     for k in range(number):
-        noun = f"point {k} of {number}"
-        row = rows.take(f"coordinates of {noun}")
+        point_name = f"point {k} of {number}"
+        row = rows.take(f"coordinates of {point_name}")
         position.append(row.numbers("XYZ"))
         lines.append(row.number)
-        colours.append(rows.take(f"colour of {noun}").numbers(POINT_COLOURS))
-        row = rows.take(f"rays of {noun}")
+        colours.append(rows.take(f"colour of {point_name}").numbers(POINT_COLOURS))
+        row = rows.take(f"rays of {point_name}")
         views = row.rays(0, "a ray", cameras, "camera")
-        line_numbers = np.full((len(views), 1), row.number)
+        line_column = np.full((len(views), 1), row.number)
         rays.append(
             np.concatenate(
-                [views[:, :1], np.full_like(line_numbers, k), views[:, 2:], line_numbers], 1
+                [views[:, :1], np.full_like(line_column, k), views[:, 2:], line_column], 1
             )
         )
     rays = np.concatenate(rays) if rays else np.zeros((0, 5))
@@ -177,7 +178,7 @@ def _points(
     return position, colours, np.array(lines, np.int64), rays
 
 
-def _names(path: Path, number: int) -> list[str]:
+def _image_names(path: Path, number: int) -> list[str]:
     """Names of the images from the list, or their numbers."""
     if path.is_file():
         lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
@@ -235,6 +236,6 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     if not numbered or names.is_file():  # an existing list would name the images
         content[names] = images.id
     with replace_files(*content) as temporary:
-        for place, text in zip(temporary, content.values()):
-            place.write_bytes(("\n".join(text) + "\n").encode())
+        for temporary_path, text in zip(temporary, content.values()):
+            temporary_path.write_bytes(("\n".join(text) + "\n").encode())
     return describe_losses(network, BUNDLER_LOSSES)

@@ -44,7 +44,7 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and line, or which entry of a binary file.
     """
     path = Path(path)
-    suffix, read_model = next(
+    suffix, reader = next(
         (
             (s, r)
             for s, r in ((".bin", read_binary_model), (".txt", read_text_model))
@@ -52,12 +52,12 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ),
         ("", None),
     )
-    if read_model is None:
+    if reader is None:
         raise InputError(f"{path}: there is no cameras.bin or cameras.txt in it")
     for part in PARTS:
         if not (path / f"{part}{suffix}").is_file():
             raise InputError(f"{path / part}{suffix}: no such file")
-    model = read_model(path)
+    model = reader(path)
     network = to_network(path, model, overrides)
     present_parts = [part for part in RIGS if (path / f"{part}{suffix}").is_file()]
     if not present_parts:
@@ -77,8 +77,8 @@ def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
     **Raises:** `InputError`.
     """
     path = Path(path)
-    read_cameras_of = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
-    return tuple(read_cameras_of(path).values())
+    reader = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
+    return tuple(reader(path).values())
 
 
 def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:

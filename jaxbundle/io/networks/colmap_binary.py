@@ -47,16 +47,16 @@ NO_POINT_ID = np.uint64(2**64 - 1)
 
 
 class BinaryFile:
-    """The bytes of a file in sequence; errors name the file and the item being read."""
+    """The bytes of a file in sequence; errors name the file and the record being read."""
 
     def __init__(self, path: Path):
         self.path = path
         self.data = read_content(path, text=False)
         self.position = 0
-        self.what = "the head"
+        self.record = "the head"
 
     def error(self, message: str) -> InputError:
-        return InputError(f"{self.path}, {self.what}: {message}")
+        return InputError(f"{self.path}, {self.record}: {message}")
 
     def take(self, format: str) -> tuple:
         return struct.unpack("<" + format, self.raw(struct.calcsize("<" + format)))
@@ -68,18 +68,20 @@ class BinaryFile:
         self.position += size
         return part
 
-    def count(self, noun: str, least_size: int) -> int:
+    def count(self, name: str, least_size: int) -> int:
         """A number of items with at least the given bytes each."""
         (count,) = self.take("Q")
-        bytes_left = len(self.data) - self.position
-        if count * least_size > bytes_left:
-            raise self.error(f"{count} {noun} are announced, but only {bytes_left} bytes follow")
+        remaining_bytes = len(self.data) - self.position
+        if count * least_size > remaining_bytes:
+            raise self.error(
+                f"{count} {name} are announced, but only {remaining_bytes} bytes follow"
+            )
         return count
 
-    def numbers(self, n: int, noun: str) -> np.ndarray:
+    def numbers(self, n: int, name: str) -> np.ndarray:
         values = np.frombuffer(self.raw(8 * n), "<f8")
         if not np.isfinite(values).all():
-            raise self.error(f"{noun}: {values[~np.isfinite(values)][0]} is not a finite number")
+            raise self.error(f"{name}: {values[~np.isfinite(values)][0]} is not a finite number")
         return values
 
     def name(self) -> str:
@@ -94,10 +96,10 @@ class BinaryFile:
             raise self.error(f"the name {text[:40]!r} is not UTF-8 text") from None
 
     def end(self) -> None:
-        bytes_left = len(self.data) - self.position
-        if bytes_left:
+        remaining_bytes = len(self.data) - self.position
+        if remaining_bytes:
             raise self.error(
-                f"{bytes_left} bytes follow the last entry; the counts do not fit the file"
+                f"{remaining_bytes} bytes follow the last entry; the counts do not fit the file"
             )
 
 
@@ -113,7 +115,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
     """The cameras of a cameras.bin by number."""
     file, cameras = BinaryFile(path), {}
     for k in range(file.count("cameras", 24)):  # bytes of a camera without parameters
-        file.what = f"camera {k + 1}"
+        file.record = f"camera {k + 1}"
         id, model, width, height = file.take("IiQQ")
         if id in cameras:
             raise file.error(f"camera {id} occurs twice")
@@ -130,7 +132,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
 def _images(path: Path) -> list[ColmapImage]:
     file, images = BinaryFile(path), []
     for k in range(file.count("images", 73)):  # without a name and image points
-        file.what = f"image {k + 1}"
+        file.record = f"image {k + 1}"
         (id,) = file.take("I")
         pose = file.numbers(7, "pose")
         (camera,) = file.take("I")
@@ -141,9 +143,8 @@ def _images(path: Path) -> list[ColmapImage]:
         has_no_point = points["point"] == NO_POINT_ID
         if (points["point"][~has_no_point] >= 2**63).any():
             raise file.error("an image point has an impossible object point")
-        point = (
-            np.where(has_no_point, 0, points["point"]).astype(np.int64) - has_no_point
-        )  # NO_POINT: −1
+        # NO_POINT is −1.
+        point = np.where(has_no_point, 0, points["point"]).astype(np.int64) - has_no_point
         images.append(
             ColmapImage(
                 id,
@@ -157,7 +158,7 @@ def _images(path: Path) -> list[ColmapImage]:
             )
         )
     file.end()
-    check_unique([image.id for image in images], lambda k: images[k].place, "image")
+    check_unique([image.id for image in images], lambda k: images[k].location, "image")
     return images
 
 
@@ -174,15 +175,15 @@ def _points(path: Path, images: Sequence[ColmapImage]) -> ColmapPoints:
     position = points["xyz"].astype(float)
 
     if (impossible := points["id"] >= 2**63).any():
-        file.what = f"point {impossible.argmax() + 1}"
+        file.record = f"point {impossible.argmax() + 1}"
         raise file.error(f"its number {points['id'][impossible][0]} is impossible")
     if (infinite := ~np.isfinite(position)).any():
-        file.what = f"point {infinite.any(1).argmax() + 1}"
+        file.record = f"point {infinite.any(1).argmax() + 1}"
         raise file.error(f"coordinates: {position[infinite][0]} is not a finite number")
     unknown = ~np.isin(track, np.array(sorted(image.id for image in images), "<u4"))
     if unknown.any():
         ray = int(unknown.argmax())
-        file.what = f"point {np.searchsorted(np.cumsum(rays), ray, 'right') + 1}"
+        file.record = f"point {np.searchsorted(np.cumsum(rays), ray, 'right') + 1}"
         raise file.error(f"the image {track[ray]} of the track is not in images")
     source, ids = Source(str(path), None, "point"), points["id"].astype(np.int64)
     check_unique(ids, source, "point")
@@ -197,19 +198,19 @@ def _track_lengths(
     COLMAP writes points by their numbers, and each with its image points: the lengths that follow
     from the images are those of the file if every point has the length expected there.
     """
-    begin_of_points, size, length = file.position, POINT.itemsize, len(file.data)
+    points_begin, size, length = file.position, POINT.itemsize, len(file.data)
     for expected in _expected_lengths(number, images):
-        ends = begin_of_points + np.cumsum(size + 8 * expected)
-        if len(expected) == number and ends[-1] == length:
-            place = ends - 8 * expected - 8
+        point_ends = points_begin + np.cumsum(size + 8 * expected)
+        if len(expected) == number and point_ends[-1] == length:
+            count_offsets = point_ends - 8 * expected - 8
             data = np.frombuffer(file.data, np.uint8)
-            if (data[place[:, None] + np.arange(8)].view("<u8").ravel() == expected).all():
+            if (data[count_offsets[:, None] + np.arange(8)].view("<u8").ravel() == expected).all():
                 return expected
-    rays_of, lengths, begin = struct.Struct("<Q").unpack_from, [], begin_of_points
+    rays_of, lengths, begin = struct.Struct("<Q").unpack_from, [], points_begin
     for k in range(number):
         end = begin + size
         if end > length or (next := end + 8 * rays_of(file.data, end - 8)[0]) > length:
-            file.what, file.position = f"point {k + 1}", begin
+            file.record, file.position = f"point {k + 1}", begin
             file.raw(size - 8)
             file.count("rays", 8)
             raise file.error("the file ends here; it is truncated")
@@ -227,16 +228,16 @@ def _expected_lengths(
     they are numbered from 1."""
     if not number or not images:
         return
-    seen_points = np.concatenate([image.point for image in images])
-    seen_points = seen_points[seen_points != NO_POINT]
+    point_ids = np.concatenate([image.point for image in images])
+    point_ids = point_ids[point_ids != NO_POINT]
     # Numbers with few gaps, as usual, are counted in a table.
-    if len(seen_points) and seen_points.max() < 8 * (len(seen_points) + number):
-        counts = np.bincount(seen_points)
+    if len(point_ids) and point_ids.max() < 8 * (len(point_ids) + number):
+        counts = np.bincount(point_ids)
         yield counts[counts > 0]
         if not counts[0] and len(counts) <= number + 1:
             yield np.concatenate([counts[1:], np.zeros(number + 1 - len(counts), counts.dtype)])
     else:
-        yield np.unique(seen_points, return_counts=True)[1]
+        yield np.unique(point_ids, return_counts=True)[1]
 
 
 def binary_files(model: ColmapModel) -> dict[str, bytes]:

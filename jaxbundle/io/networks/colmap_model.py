@@ -38,7 +38,7 @@ NO_POINT = -1
 @dataclasses.dataclass(frozen=True)
 class ColmapImage:
     """An image: quaternion (w, x, y, z) and shift of the pose, image points and their object
-    points (−1: none); `place` for messages."""
+    points (−1: none); `location` for messages."""
 
     id: int
     camera: int
@@ -47,7 +47,7 @@ class ColmapImage:
     t: Float[np.ndarray, "3"]
     xy: Float[np.ndarray, "n 2"]
     point: Int[np.ndarray, " n"]
-    place: str
+    location: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,16 +78,16 @@ class ColmapPoints:
 
 
 def check_unique(
-    ids: Sequence[int] | Int[np.ndarray, " rows"], place: Callable[[int], object], noun: str
+    ids: Sequence[int] | Int[np.ndarray, " rows"], location_of: Callable[[int], object], name: str
 ) -> None:
-    """Refuse repeated numbers; `place(k)` names the position of the k-th."""
+    """Refuse repeated numbers; `location_of(k)` names the position of the k-th."""
     ids = np.asarray(ids)
     if (ids[1:] > ids[:-1]).all():
         return  # in order, as most files are
     values, first_rows, counts = np.unique(ids, return_index=True, return_counts=True)
     for value in values[counts > 1][:1]:
-        repeated_row = np.flatnonzero(ids == value)[1]
-        raise InputError(f"{place(repeated_row)}: {noun} {value} occurs twice")
+        second_row = np.flatnonzero(ids == value)[1]
+        raise InputError(f"{location_of(second_row)}: {name} {value} occurs twice")
 
 
 def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Network:
@@ -103,19 +103,19 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
     for image in images:
         if image.camera not in model.cameras:
             raise InputError(
-                f"{image.place}: image {image.name!r} has the camera {image.camera}, which is "
+                f"{image.location}: image {image.name!r} has the camera {image.camera}, which is "
                 "not in cameras"
             )
         # Of any other length, it is normalised.
         if not np.any(image.q):
-            raise InputError(f"{image.place}: image {image.name!r}: the quaternion is 0")
+            raise InputError(f"{image.location}: image {image.name!r}: the quaternion is 0")
     names = [image.name for image in images]
     if len(set(names)) < len(names):
-        twice = next(name for k, name in enumerate(names) if name in names[:k])
-        raise InputError(f"{path}: two images are called {twice!r}")
+        repeated_name = next(name for k, name in enumerate(names) if name in names[:k])
+        raise InputError(f"{path}: two images are called {repeated_name!r}")
     R = matrices_of_quaternions(np.stack([image.q for image in images]))
     M, X0 = exterior_from_cv(R, np.stack([image.t for image in images]))
-    observed, warnings = _observations(path, model)
+    rays, warnings = _observations(path, model)
     numbers = np.arange(1, len(images) + 1)
     return assemble(
         path,
@@ -132,7 +132,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
             },
             model.points.source,
         ),
-        observed,
+        rays,
         warnings,
     )
 
@@ -140,10 +140,10 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
 def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, ...]]:
     """The table of image points; the first if an image has several of one object point."""
     image = np.repeat(
-        np.arange(len(model.images)), [len(model_image.point) for model_image in model.images]
+        np.arange(len(model.images)), [len(colmap_image.point) for colmap_image in model.images]
     )
-    point = np.concatenate([model_image.point for model_image in model.images])
-    xy = np.concatenate([model_image.xy for model_image in model.images]) - PIXEL_CENTRE
+    point = np.concatenate([colmap_image.point for colmap_image in model.images])
+    xy = np.concatenate([colmap_image.xy for colmap_image in model.images]) - PIXEL_CENTRE
     has_point = point != NO_POINT
     if not has_point.all():
         image, point, xy = image[has_point], point[has_point], xy[has_point]
@@ -154,19 +154,18 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
     ray, warnings = image * len(model.points.ids) + row, ()
     in_order = np.sort(ray)
     if (in_order[1:] == in_order[:-1]).any():
-        _, first_rows = np.unique(ray, return_index=True)
-        repeated_rows = np.delete(image, first_rows)
-        first_rows.sort()
-        image, row, xy = image[first_rows], row[first_rows], xy[first_rows]
-        names = dict.fromkeys(model.images[k].name for k in repeated_rows.tolist())
+        _, first_rays = np.unique(ray, return_index=True)
+        repeated_images = np.delete(image, first_rays)
+        first_rays.sort()
+        image, row, xy = image[first_rays], row[first_rays], xy[first_rays]
+        names = dict.fromkeys(model.images[k].name for k in repeated_images.tolist())
         warnings = (
-            f"left out {count(len(repeated_rows), 'image point')} of object points that have "
-            "another in "
-            f"the same image: {list_some(names)}",
+            f"left out {count(len(repeated_images), 'image point')} of object points that have "
+            f"another in the same image: {list_some(names)}",
         )
     columns = {
         "image": RepeatedIds(
-            [model_image.name for model_image in model.images], image, are_rows=True
+            [colmap_image.name for colmap_image in model.images], image, are_rows=True
         ),
         "point": RepeatedIds(model.points.ids, row, are_rows=True),
         "x": xy[:, 0],
@@ -176,21 +175,19 @@ def _observations(path: Path, model: ColmapModel) -> tuple[Columns, tuple[str, .
     return Columns(columns, source), warnings
 
 
-def find_rows(
-    ids: Int[np.ndarray, " n"], wanted_ids: Int[np.ndarray, " m"]
-) -> Int[np.ndarray, " m"]:
+def find_rows(ids: Int[np.ndarray, " n"], numbers: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
     """The rows of numbers in a column of different ones; −1 where there is none."""
-    if not len(ids) or not len(wanted_ids):
-        return np.full(len(wanted_ids), -1)
+    if not len(ids) or not len(numbers):
+        return np.full(len(numbers), -1)
     # Numbers with few gaps, as usual, are looked up in a table: a tenth of the time of a search.
     if ids.min() >= 0 and ids.max() < 8 * len(ids):
         table = np.full(ids.max() + 1, -1)
         table[ids] = np.arange(len(ids))
-        is_known = (wanted_ids >= 0) & (wanted_ids < len(table))
-        return np.where(is_known, table[np.where(is_known, wanted_ids, 0)], -1)
+        in_table = (numbers >= 0) & (numbers < len(table))
+        return np.where(in_table, table[np.where(in_table, numbers, 0)], -1)
     order = np.argsort(ids)
-    place = np.minimum(np.searchsorted(ids, wanted_ids, sorter=order), len(ids) - 1)
-    return np.where(ids[order[place]] == wanted_ids, order[place], -1)
+    position = np.minimum(np.searchsorted(ids, numbers, sorter=order), len(ids) - 1)
+    return np.where(ids[order[position]] == numbers, order[position], -1)
 
 
 def _refuse_unknown_points(model: ColmapModel) -> None:
@@ -200,7 +197,7 @@ def _refuse_unknown_points(model: ColmapModel) -> None:
         if unknown.any():
             k = int(unknown.argmax())
             raise InputError(
-                f"{image.place}: image {image.name!r}, image point {k}: the object point "
+                f"{image.location}: image {image.name!r}, image point {k}: the object point "
                 f"{image.point[k]} is not in points3D"
             )
 
@@ -219,20 +216,20 @@ def from_network(network: Network) -> ColmapModel:
     q = quaternions_of(R)
     camera_numbers = list(cameras)
     point_numbers = np.array(numbers_of(points.id), np.int64)
-    images_made = []
+    colmap_images = []
     # The rays image by image, in one pass: masks of every image would be quadratic.
     order = np.argsort(rays.image, kind="stable")
-    parts = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
-    for i, (number, rays_of_image) in enumerate(zip(numbers_of(images.id), parts)):
-        images_made.append(
+    rays_of_images = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
+    for i, (number, ray_rows) in enumerate(zip(numbers_of(images.id), rays_of_images)):
+        colmap_images.append(
             ColmapImage(
                 number,
                 camera_numbers[images.camera[i]],
                 images.id[i],
                 q[i],
                 t[i],
-                rays.xy[rays_of_image] + PIXEL_CENTRE,
-                point_numbers[rays.point[rays_of_image]],
+                rays.xy[ray_rows] + PIXEL_CENTRE,
+                point_numbers[rays.point[ray_rows]],
                 f"image {images.id[i]!r}",
             )
         )
@@ -240,7 +237,7 @@ def from_network(network: Network) -> ColmapModel:
     errors = np.nan_to_num(point_errors(network)[0], nan=-1.0)
     return ColmapModel(
         cameras,
-        images_made,
+        colmap_images,
         ColmapPoints(
             point_numbers, points.position, points.colour_or_grey(), points.source, errors
         ),
@@ -250,8 +247,8 @@ def from_network(network: Network) -> ColmapModel:
 def numbers_of(ids: Sequence[str]) -> list[int]:
     """The ids if all are whole numbers from 1, else 1, 2, 3, …"""
     # Nine digits: COLMAP's ids have 32 bits.
-    good = all(id.isascii() and id.isdigit() and len(id) < 10 and id[0] != "0" for id in ids)
-    return [int(id) for id in ids] if good else list(range(1, len(ids) + 1))
+    are_numbers = all(id.isascii() and id.isdigit() and len(id) < 10 and id[0] != "0" for id in ids)
+    return [int(id) for id in ids] if are_numbers else list(range(1, len(ids) + 1))
 
 
 def tracks(model: ColmapModel) -> dict[int, list[tuple[int, int]]]:
@@ -263,7 +260,7 @@ def tracks(model: ColmapModel) -> dict[int, list[tuple[int, int]]]:
     return rays
 
 
-def _renumbered(ids: Sequence[str]) -> int:
+def _count_renumbered(ids: Sequence[str]) -> int:
     return changed(ids, numbers_of(ids))
 
 
@@ -272,7 +269,7 @@ COLMAP_LOSSES = losing(
     "pixel sizes of cameras",
     keeping=("rigs",),
     partly={
-        "names of cameras": lambda n: _renumbered([camera.id for camera in n.cameras]),
-        "names of points": lambda n: _renumbered(n.points.id),
+        "names of cameras": lambda n: _count_renumbered([camera.id for camera in n.cameras]),
+        "names of points": lambda n: _count_renumbered(n.points.id),
     },
 )

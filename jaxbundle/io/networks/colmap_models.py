@@ -56,7 +56,7 @@ MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
 }
 NAMES = {number: name for name, (number, *_) in MODELS.items()}
 # Our models that COLMAP has.
-COLMAP_MODELS = tuple(dict.fromkeys(ours for _, ours, _ in MODELS.values()))
+COLMAP_MODELS = tuple(dict.fromkeys(our_model for _, our_model, _ in MODELS.values()))
 
 
 def parameter_names(model: str, error: Callable[[str], InputError]) -> tuple[str, ...]:
@@ -113,17 +113,19 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
     size = size_of(camera, "COLMAP")
     p = all_parameters(camera)
     if camera.model == "equirectangular":
-        panorama = _panorama(*map(float, size))
-        if not np.allclose([p[name] for name in panorama], [*panorama.values()], rtol=1e-12):
+        full_panorama = _panorama(*map(float, size))
+        if not np.allclose(
+            [p[name] for name in full_panorama], [*full_panorama.values()], rtol=1e-12
+        ):
             raise InputError(f"{where}: COLMAP has whole panoramas only, of the image size")
         return "EQUIRECTANGULAR", [float(size[0]), float(size[1])]
     p["cx"], p["cy"] = p["cx"] + PIXEL_CENTRE, p["cy"] + PIXEL_CENTRE
-    needed = {name for name, value in p.items() if value != 0 or name in ("cx", "cy")}
+    needed_names = {name for name, value in p.items() if value != 0 or name in ("cx", "cy")}
     if p["fx"] == p["fy"]:
-        needed = needed - {"fx", "fy"} | {"f"}
+        needed_names = needed_names - {"fx", "fy"} | {"f"}
         p["f"] = p["fx"]
     for name, names in candidates:
         # A model of two focal lengths holds equal ones too.
-        if needed <= {*names, *(("f",) if "fx" in names else ())}:
+        if needed_names <= {*names, *(("f",) if "fx" in names else ())}:
             return name, [p[key] for key in names]
     raise InputError(f"{where}: COLMAP has no thin prism (s1 to s4); convert it without them")

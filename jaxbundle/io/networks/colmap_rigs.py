@@ -47,12 +47,12 @@ POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 
 
 class ColmapFrame(NamedTuple):
-    """A moment of a rig, and the numbers of its images; `place` for messages."""
+    """A moment of a rig, and the numbers of its images; `location` for messages."""
 
     id: int
     rig: int
     images: tuple[int, ...]
-    place: str
+    location: str
 
 
 def read_frames(folder: Path, suffix: str) -> list[ColmapFrame]:
@@ -64,7 +64,7 @@ def read_frames(folder: Path, suffix: str) -> list[ColmapFrame]:
     frames = (_binary_frames if binary else _text_frames)(folder / f"frames{suffix}")
     for frame in frames:
         if frame.rig not in rigs:
-            raise InputError(f"{frame.place}: rig {frame.rig} is not in rigs{suffix}")
+            raise InputError(f"{frame.location}: rig {frame.rig} is not in rigs{suffix}")
     return frames
 
 
@@ -82,7 +82,7 @@ def rigs_of_frames(
         for image in frame.images:
             if image in frame_of_image:
                 raise InputError(
-                    f"{frame.place}: image {image} is in frame {frame_of_image[image]} as well; "
+                    f"{frame.location}: image {image} is in frame {frame_of_image[image]} as well; "
                     "expected one"
                 )
             frame_of_image[image] = frame.id
@@ -103,18 +103,18 @@ class _Words:
     def __init__(self, row: TextRow):
         self.row, self.position = row, 0
 
-    def integer(self, noun: str) -> int:
+    def integer(self, expected: str) -> int:
         self.position += 1
-        return self.row.integer(self.position - 1, noun)
+        return self.row.integer(self.position - 1, expected)
 
-    def word(self, noun: str) -> str:
+    def word(self, expected: str) -> str:
         if self.position >= len(self.row):
-            raise self.row.error(f"the line ends; expected {noun}")
+            raise self.row.error(f"the line ends; expected {expected}")
         self.position += 1
         return self.row.words[self.position - 1]
 
     def pose(self) -> None:
-        self.row.numbers(POSE, self.position, more=True)
+        self.row.numbers(POSE, self.position, allow_more=True)
         self.position += len(POSE)
 
     def end(self) -> None:
@@ -155,11 +155,11 @@ def _text_frames(path: Path) -> list[ColmapFrame]:
     return frames
 
 
-def _entries(path: Path, noun: str, min_bytes: int) -> Iterator[tuple[BinaryFile, int]]:
-    """The file at each of its entries, of `min_bytes` bytes or more; its end is checked."""
+def _entries(path: Path, name: str, min_bytes: int) -> Iterator[tuple[BinaryFile, int]]:
+    """The file at each of its entries, of `min_bytes` or more; its end is checked."""
     file = BinaryFile(path)
-    for k in range(file.count(noun, min_bytes)):
-        file.what = f"{noun.removesuffix('s')} {k + 1}"
+    for k in range(file.count(name, min_bytes)):
+        file.record = f"{name.removesuffix('s')} {k + 1}"
         yield file, k
     file.end()
 
@@ -200,7 +200,7 @@ class WrittenRig(NamedTuple):
 
     id: int
     reference: int
-    others: dict[int, SensorPose]
+    other_sensors: dict[int, SensorPose]
 
 
 class WrittenFrame(NamedTuple):
@@ -225,25 +225,25 @@ def rigs_and_frames(
     """
     R, t = cv_pose(matrices_of(network.images.angles), network.images.position)
     # Names are kept if they are numbers.
-    rigs_by_name = {
+    mounted_rigs = {
         name: rig
         for kind in network.further
         if isinstance(kind, Rigs)
         for name, rig in kind.mounted(network).items()
     }
-    names = [(name, epoch) for name, rig in rigs_by_name.items() for epoch in rig.epochs]
-    rig_ids = dict(zip(rigs_by_name, numbers_of([*rigs_by_name])))
+    names = [(name, epoch) for name, rig in mounted_rigs.items() for epoch in rig.epochs]
+    rig_ids = dict(zip(mounted_rigs, numbers_of([*mounted_rigs])))
     epochs = [epoch for _, epoch in names]
-    plain = len({*epochs}) == len(epochs)
-    frame_ids = dict(zip(names, numbers_of(epochs) if plain else range(1, len(names) + 1)))
+    are_unique = len({*epochs}) == len(epochs)
+    frame_ids = dict(zip(names, numbers_of(epochs) if are_unique else range(1, len(names) + 1)))
     new_rig = count_from(1 + max(rig_ids.values(), default=0))
     new_frame = count_from(1 + max(frame_ids.values(), default=0))
 
     rigs: list[WrittenRig] = []
     frames: list[WrittenFrame] = []
-    made_R, made_t = R.copy(), t.copy()
-    free = {*range(len(network.cameras))}  # cameras, images without a rig, a frame
-    images_left = {*range(len(network.images))}
+    written_R, written_t = R.copy(), t.copy()
+    unrigged_cameras = {*range(len(network.cameras))}  # cameras, images without a rig, a frame
+    unframed_images = {*range(len(network.images))}
 
     def add_frame(id: int, rig: int, sensors: Mapping[int, Pose], epoch: Mapping[int, int]) -> None:
         camera, image = next(((c, i) for c, i in epoch.items() if c == next(iter(sensors))),
@@ -251,77 +251,84 @@ def rigs_and_frames(
         Rs, ts = sensors[camera]
         R_frame, t_frame = Rs.T @ R[image], Rs.T @ (t[image] - ts)
         for c, i in epoch.items():
-            made_R[i], made_t[i] = sensors[c][0] @ R_frame, sensors[c][0] @ t_frame + sensors[c][1]
-        images_left.difference_update(epoch.values())
+            written_R[i], written_t[i] = (
+                sensors[c][0] @ R_frame,
+                sensors[c][0] @ t_frame + sensors[c][1],
+            )
+        unframed_images.difference_update(epoch.values())
         numbers = {cameras[c]: images[i] for c, i in epoch.items()}
-        frames.append(WrittenFrame(id, rig, _as_written(R_frame, t_frame), numbers))
+        frames.append(WrittenFrame(id, rig, _sensor_pose(R_frame, t_frame), numbers))
 
-    parted = 0
-    for name, rig in rigs_by_name.items():
-        sensors = _sensors(rig, free)
+    separated_count = 0
+    for name, rig in mounted_rigs.items():
+        sensors = _sensor_poses(rig, unrigged_cameras)
         if len(sensors) < 2:
-            parted += sum(map(len, rig.epochs.values()))
+            separated_count += sum(map(len, rig.epochs.values()))
             continue
-        free -= sensors.keys()
-        _, *other_sensors = sensors
+        unrigged_cameras -= sensors.keys()
+        _, *other_cameras = sensors
         rigs.append(
             WrittenRig(
                 rig_ids[name],
                 cameras[rig.reference],
-                {cameras[c]: _as_written(*sensors[c]) for c in other_sensors},
+                {cameras[c]: _sensor_pose(*sensors[c]) for c in other_cameras},
             )
         )
-        for epoch, of_camera in rig.epochs.items():
-            images_of_sensors = {c: i for c, i in of_camera.items() if c in sensors}
-            parted += len(of_camera) - len(images_of_sensors)
-            if images_of_sensors:
-                add_frame(frame_ids[name, epoch], rig_ids[name], sensors, images_of_sensors)
-        for i in sorted(images_left):
+        for epoch, epoch_images in rig.epochs.items():
+            rig_images = {c: i for c, i in epoch_images.items() if c in sensors}
+            separated_count += len(epoch_images) - len(rig_images)
+            if rig_images:
+                add_frame(frame_ids[name, epoch], rig_ids[name], sensors, rig_images)
+        for i in sorted(unframed_images):
             if (c := int(network.images.camera[i])) in sensors:
                 add_frame(next(new_frame), rig_ids[name], sensors, {c: i})
-    for c in sorted(free):
+    for c in sorted(unrigged_cameras):
         rigs.append(WrittenRig(next(new_rig), cameras[c], {}))
-        single_camera = {c: (np.eye(3), np.zeros(3))}
+        single_sensor = {c: (np.eye(3), np.zeros(3))}
         for i in np.flatnonzero(network.images.camera == c).tolist():
-            if i in images_left:
-                add_frame(next(new_frame), rigs[-1].id, single_camera, {c: i})
-    losses = [f"the rig of {count(parted, 'image')}"] if parted else []
-    if [*map(str, rig_ids.values())] != [*rigs_by_name] or [
+            if i in unframed_images:
+                add_frame(next(new_frame), rigs[-1].id, single_sensor, {c: i})
+    losses = [f"the rig of {count(separated_count, 'image')}"] if separated_count else []
+    if [*map(str, rig_ids.values())] != [*mounted_rigs] or [
         *map(str, frame_ids.values())
     ] != epochs:
         losses.append("names of rigs and epochs, which are numbered")
-    return rigs, frames, losses + _changed(R, t, made_R, made_t)
+    return rigs, frames, losses + _describe_changes(R, t, written_R, written_t)
 
 
-def _sensors(rig: MountedCameras, free: Container[int]) -> dict[int, Pose]:
+def _sensor_poses(rig: MountedCameras, unrigged_cameras: Container[int]) -> dict[int, Pose]:
     """The poses of cameras that are in no other rig, in COLMAP's frames, the reference first; none
     without it."""
-    if rig.reference not in free:
+    if rig.reference not in unrigged_cameras:
         return {}
     flip = np.diag([1.0, -1.0, -1.0])  # from our camera frame to that of COLMAP
     return {
         c: (flip @ mounting.rotation @ flip, -flip @ mounting.rotation @ mounting.position)
         for c, mounting in rig.mountings.items()
-        if mounting is not None and c in free
+        if mounting is not None and c in unrigged_cameras
     }
 
 
-def _as_written(R: np.ndarray, t: np.ndarray) -> SensorPose:
+def _sensor_pose(R: np.ndarray, t: np.ndarray) -> SensorPose:
     return SensorPose(quaternions_of(R[None])[0], t)
 
 
-def _changed(R: np.ndarray, t: np.ndarray, made_R: np.ndarray, made_t: np.ndarray) -> list[str]:
+def _describe_changes(
+    R: np.ndarray, t: np.ndarray, written_R: np.ndarray, written_t: np.ndarray
+) -> list[str]:
     """The largest change of orientations, if it is more than rounding."""
-    D = R @ made_R.transpose(0, 2, 1)
+    D = R @ written_R.transpose(0, 2, 1)
     axis = np.stack([D[:, 1, 2] - D[:, 2, 1], D[:, 2, 0] - D[:, 0, 2], D[:, 0, 1] - D[:, 1, 0]])
-    turn = np.arctan2(np.linalg.norm(axis, axis=0), np.trace(D, axis1=1, axis2=2) - 1).max()
-    shift = np.linalg.norm(made_t - t, axis=1).max()
+    rotation_angle = np.arctan2(
+        np.linalg.norm(axis, axis=0), np.trace(D, axis1=1, axis2=2) - 1
+    ).max()
+    translation_change = np.linalg.norm(written_t - t, axis=1).max()
     # Products of three matrices in double precision, and coordinates of 1e6.
-    if turn <= 1e-9 and shift <= 1e-9 * max(abs(t).max(), 1.0):
+    if rotation_angle <= 1e-9 and translation_change <= 1e-9 * max(abs(t).max(), 1.0):
         return []
     return [
         "orientations that contradict the mountings of their rig, one a camera: up to "
-        f"{shift:.3g} and {np.degrees(turn):.3g}°"
+        f"{translation_change:.3g} and {np.degrees(rotation_angle):.3g}°"
     ]
 
 
@@ -341,9 +348,9 @@ def _text_files(rigs: Sequence[WrittenRig], frames: Sequence[WrittenFrame]) -> d
     ]
     for rig in rigs:
         other_sensors = (
-            f" {CAMERA} {c} 1 {join_numbers((*q, *t))}" for c, (q, t) in rig.others.items()
+            f" {CAMERA} {c} 1 {join_numbers((*q, *t))}" for c, (q, t) in rig.other_sensors.items()
         )
-        head = f"{rig.id} {1 + len(rig.others)} {CAMERA} {rig.reference}"
+        head = f"{rig.id} {1 + len(rig.other_sensors)} {CAMERA} {rig.reference}"
         rig_lines.append(head + "".join(other_sensors))
     frame_lines = [
         "# FRAME_ID, RIG_ID, QW, QX, QY, QZ, TX, TY, TZ, NUM_DATA_IDS, DATA_IDS[] as "
@@ -354,17 +361,17 @@ def _text_files(rigs: Sequence[WrittenRig], frames: Sequence[WrittenFrame]) -> d
         pose = join_numbers((*frame.pose.q, *frame.pose.t))
         frame_lines.append(f"{frame.id} {frame.rig} {pose} {len(frame.images)} {data}")
     lines = {"rigs.txt": rig_lines, "frames.txt": frame_lines}
-    return {name: ("\n".join(some) + "\n").encode() for name, some in lines.items()}
+    return {name: ("\n".join(file_lines) + "\n").encode() for name, file_lines in lines.items()}
 
 
 def _binary_files(rigs: Sequence[WrittenRig], frames: Sequence[WrittenFrame]) -> dict[str, bytes]:
     of_rigs = [struct.pack("<Q", len(rigs))]
     for rig in rigs:
-        head = (rig.id, 1 + len(rig.others), CAMERA_NUMBER, rig.reference)
+        head = (rig.id, 1 + len(rig.other_sensors), CAMERA_NUMBER, rig.reference)
         of_rigs.append(struct.pack("<IIiI", *head))
         of_rigs += [
             struct.pack("<iIB7d", CAMERA_NUMBER, camera, 1, *q, *t)
-            for camera, (q, t) in rig.others.items()
+            for camera, (q, t) in rig.other_sensors.items()
         ]
     of_frames = [struct.pack("<Q", len(frames))]
     for frame in frames:

@@ -57,7 +57,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
             raise row.error(f"camera {number} occurs twice")
         model = row.words[1] if len(row) > 1 else ""
         names = parameter_names(model, row.error)
-        size = [row.integer(k, noun, 1) for k, noun in ((2, "WIDTH"), (3, "HEIGHT"))]
+        size = [row.integer(k, name, 1) for k, name in ((2, "WIDTH"), (3, "HEIGHT"))]
         values = row.numbers(names, 4)
         cameras[number] = from_colmap(str(number), model, size, values)
     return cameras
@@ -67,7 +67,7 @@ def _images(path: Path) -> list[ColmapImage]:
     # Comments are skipped only before heads: the line of image points may be empty.
     rows = TextRows(path, "#", blank=True)
     heads, points = [], []
-    while rows.more():
+    while rows.has_more():
         head = rows.take("an image")
         if not head.words:
             continue
@@ -76,9 +76,9 @@ def _images(path: Path) -> list[ColmapImage]:
                 f"{len(head)} values where an image is expected: IMAGE_ID, "
                 f"{', '.join(QT)}, CAMERA_ID, NAME"
             )
-        heads.append((head, head.numbers(QT, 1, more=True)))
+        heads.append((head, head.numbers(QT, 1, allow_more=True)))
         points.append(
-            rows.take("the image points of an image") if rows.more() else TextRow(path, 0, "")
+            rows.take("the image points of an image") if rows.has_more() else TextRow(path, 0, "")
         )
     # All lines at once; one by one if there is a fault in any.
     parsed = parse_lines(row.text for row in points)
@@ -105,19 +105,19 @@ def _images(path: Path) -> list[ColmapImage]:
                 f"{path}, line {head.number}",
             )
         )
-    check_unique([image.id for image in images], lambda k: images[k].place, "image")
+    check_unique([image.id for image in images], lambda k: images[k].location, "image")
     return images
 
 
 def _points(path: Path, images: set[int]) -> ColmapPoints:
     """The points; tracks are only checked, since the image points name their object points."""
     rows = TextRows(path, "#")
-    if (parsed := _plain_points(path, rows.lines, images)) is not None:
-        return parsed
+    if (points := _parse_points_at_once(path, rows.lines, images)) is not None:
+        return points
     ids, values, lines = [], [], []
     for row in rows:
         ids.append(row.integer(0, "POINT3D_ID"))
-        values.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:6])
+        values.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, allow_more=True)[:6])
         lines.append(row.number)
         if len(row) % 2:
             raise row.error("the track has an IMAGE_ID without its POINT2D_IDX")
@@ -130,7 +130,7 @@ def _points(path: Path, images: set[int]) -> ColmapPoints:
     return ColmapPoints(np.array(ids, np.int64), values[:, :3], values[:, 3:], source)
 
 
-def _plain_points(
+def _parse_points_at_once(
     path: Path, lines: Sequence[tuple[int, str]], images: set[int]
 ) -> ColmapPoints | None:
     """The same at once; None if something is unusual, and read line by line."""
@@ -138,18 +138,18 @@ def _plain_points(
         numbers = parse_numbers(END_OF_LINE.join([*(line for _, line in lines), ""]))
     except ValueError:
         return None
-    ends = np.flatnonzero(np.isnan(numbers))
-    number = np.diff(ends, prepend=-1) - 1  # of every line
+    row_ends = np.flatnonzero(np.isnan(numbers))
+    number = np.diff(row_ends, prepend=-1) - 1  # of every line
     # Beyond 2⁵² floats are all whole: a number there has lost digits.
-    plain = len(ends) == len(lines) and (number >= 8).all() and (number % 2 == 0).all()
-    if not plain or not (np.abs(numbers) < 2**52).sum() == len(numbers) - len(ends):
+    is_regular = len(row_ends) == len(lines) and (number >= 8).all() and (number % 2 == 0).all()
+    if not is_regular or not (np.abs(numbers) < 2**52).sum() == len(numbers) - len(row_ends):
         return None
-    first_words = ends - number
+    begin = row_ends - number
     is_track = np.ones(len(numbers), bool)
-    is_track[ends] = False
-    is_track[first_words[:, None] + np.arange(8)] = False
+    is_track[row_ends] = False
+    is_track[begin[:, None] + np.arange(8)] = False
     # Pairs of an image and the index of its image point.
-    track, ids = numbers[is_track][::2], numbers[first_words]
+    track, ids = numbers[is_track][::2], numbers[begin]
     image = track.astype(np.int64)  # whole numbers are looked up in a table, others sorted
     if (image != track).any() or not np.isin(image, [*images]).all():
         return None
@@ -159,7 +159,7 @@ def _plain_points(
     # The line of every point.
     source = Source(str(path), np.array([number for number, _ in lines], np.int64), "line")
     check_unique(ids, source, "point")
-    values = numbers[first_words[:, None] + np.arange(1, 7)]
+    values = numbers[begin[:, None] + np.arange(1, 7)]
     return ColmapPoints(ids, values[:, :3], values[:, 3:], source)
 
 

@@ -121,7 +121,7 @@ def read_column_map(
         where = f"{path}, [table.{name}]"
         columns = _read_table(path.parent, where, entry)
         if name == "images":
-            columns = _rotate(where, entry, columns, ANGLE_UNITS.get(angle_unit, 1.0))
+            columns = _convert_rotations(where, entry, columns, ANGLE_UNITS.get(angle_unit, 1.0))
         if name == "points" and "role" not in columns.values:
             rows = ["tie"] * len(columns)
             columns = Columns({**columns.values, "role": rows}, columns.source)
@@ -138,14 +138,14 @@ def _read_table(folder: Path, where: str, entry: Mapping) -> Columns:
         raise InputError(f"{where}: file is {show(file)}; expected the name of a file")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: columns must be a list of names")
-    allows_more = bool(names) and names[-1] == ANY_FURTHER
-    names = names[:-1] if allows_more else names
-    column_of = {name: k for k, name in enumerate(names) if name != UNUSED_COLUMN}
-    if len(column_of) + names.count(UNUSED_COLUMN) < len(names):
+    has_further_columns = bool(names) and names[-1] == ANY_FURTHER
+    names = names[:-1] if has_further_columns else names
+    column_index = {name: k for k, name in enumerate(names) if name != UNUSED_COLUMN}
+    if len(column_index) + names.count(UNUSED_COLUMN) < len(names):
         raise InputError(f"{where}: a column occurs twice")
     scale, constant = (_table(where, entry, key) for key in ("scale", "constant"))
     for name, factor in scale.items():
-        if name not in column_of or name in IDS:
+        if name not in column_index or name in IDS:
             raise InputError(f"{where}: scale of {name!r}: no such column of numbers")
         if isinstance(factor, bool) or not isinstance(factor, int | float) or factor == 0:
             raise InputError(f"{where}: scale of {name} is {show(factor)}; expected a number")
@@ -157,19 +157,19 @@ def _read_table(folder: Path, where: str, entry: Mapping) -> Columns:
     comment = entry.get("comment", "")
     if not isinstance(comment, str):
         raise InputError(f"{where}: comment is {show(comment)}; expected text")
-    texts: dict[str, list[str]] = {name: [] for name in column_of}
+    texts: dict[str, list[str]] = {name: [] for name in column_index}
     lines = []
     for row in TextRows(folder / file, comment, separator=_separator(where, entry)):
         if row.number <= skip:
             continue
-        if len(row) < len(names) or (len(row) > len(names) and not allows_more):
+        if len(row) < len(names) or (len(row) > len(names) and not has_further_columns):
             raise row.error(
                 f"{len(row)} columns where {where} has {len(names)}: {', '.join(names)}"
             )
-        for name, k in column_of.items():
+        for name, k in column_index.items():
             text = row.words[k]
-            swap = decimal == "," and name not in IDS  # an id may have a comma
-            texts[name].append(text.replace(",", ".") if swap else text)
+            has_decimal_comma = decimal == "," and name not in IDS  # an id may have a comma
+            texts[name].append(text.replace(",", ".") if has_decimal_comma else text)
         lines.append(row.number)
     source = Source(str(folder / file), np.array(lines, np.int64), "line")
     columns = Columns({**texts, **{k: [v] * len(lines) for k, v in constant.items()}}, source)
@@ -197,7 +197,7 @@ def _separator(where: str, entry: Mapping) -> str | None:
     return separator
 
 
-def _rotate(where: str, entry: Mapping, columns: Columns, radians: float) -> Columns:
+def _convert_rotations(where: str, entry: Mapping, columns: Columns, radians: float) -> Columns:
     """The table of images with ω, φ, κ in the unit of the project."""
     kind = entry.get("rotation", "omega-phi-kappa")
     if kind not in ROTATIONS:

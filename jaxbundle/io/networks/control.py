@@ -187,11 +187,11 @@ def select_checks(points: Points, selection: Sequence[str]) -> Points:
     **Raises:** `InputError` for a name that is not a control point, or if no control is left."""
     rows = np.flatnonzero(points.has_role("control", "fixed", "check"))
     control_ids = [points.id[k] for k in rows]
-    chosen_ids: set[str] = set()
+    check_ids: set[str] = set()
     for text in selection:
         every_match = EVERY.match(text.strip())
         if every_match and (step := int(every_match[1])) > 1:
-            chosen_ids |= {*control_ids[step // 2 :: step]}
+            check_ids |= {*control_ids[step // 2 :: step]}
             continue
         for name in [text] if text in control_ids else [part.strip() for part in text.split(",")]:
             if name not in control_ids:
@@ -199,9 +199,9 @@ def select_checks(points: Points, selection: Sequence[str]) -> Points:
                     f"--check {name}: expected a control point of {points.source.name}, or every "
                     f"3rd{did_you_mean(name, control_ids)}"
                 )
-            chosen_ids.add(name)
-    roles = tuple("check" if id in chosen_ids else role for id, role in zip(points.id, points.role))
-    if chosen_ids and not {"control", "fixed"} & set(roles):
+            check_ids.add(name)
+    roles = tuple("check" if id in check_ids else role for id, role in zip(points.id, points.role))
+    if check_ids and not {"control", "fixed"} & set(roles):
         raise InputError(
             f"--check: all {len(control_ids)} control points are check points; none is left"
         )
@@ -223,7 +223,7 @@ def with_control(
     """
     index = {id: k for k, id in enumerate(network.points.id)}
     rows = [k for k, id in enumerate(control.id) if id in index]
-    places = np.array([index[control.id[k]] for k in rows], np.int64)
+    point_rows = np.array([index[control.id[k]] for k in rows], np.int64)
     if not rows:
         raise InputError(
             f"{control.source.name}: none of its {len(control)} points is one of the network; it "
@@ -231,20 +231,20 @@ def with_control(
         )
     if degrees := name_degrees(control):
         raise InputError(f"{control.source.name}: {degrees}")
-    network = _transform_into_frame(network, places, control.take(np.array(rows)), settings)
+    network = _transform_into_frame(network, point_rows, control.take(np.array(rows)), settings)
     points = network.points
-    is_named = np.zeros(len(points), bool)
-    is_named[places] = True
+    in_table = np.zeros(len(points), bool)
+    in_table[point_rows] = True
     dropped = [
         id
-        for id, role, is_there in zip(points.id, points.role, is_named)
-        if role in ("control", "fixed") and not is_there
+        for id, role, is_listed in zip(points.id, points.role, in_table)
+        if role in ("control", "fixed") and not is_listed
     ]
     roles = np.array(points.role, dtype=object)
-    roles[points.has_role("control", "fixed") & ~is_named] = "tie"
-    roles[places] = [control.role[k] for k in rows]
+    roles[points.has_role("control", "fixed") & ~in_table] = "tie"
+    roles[point_rows] = [control.role[k] for k in rows]
     position, sigma = points.position.copy(), np.full_like(points.sigma, np.nan)
-    position[places], sigma[places] = control.position[rows], control.sigma[rows]
+    position[point_rows], sigma[point_rows] = control.position[rows], control.sigma[rows]
     changed = {"datum": "control"} if datum and set(roles) & {"control", "fixed"} else {}
     network = network.replace(
         points=dataclasses.replace(
@@ -252,25 +252,28 @@ def with_control(
         ),
         **changed,
     )
-    missing_ids = [id for id in control.id if id not in index]
+    unseen_ids = [id for id in control.id if id not in index]
     warnings, notes = [], []
     if dropped:
-        points = count(len(dropped), "control point")
+        dropped_count = count(len(dropped), "control point")
         warnings.append(
-            f"{points} of the input not in {control.source.name} became tie points: "
+            f"{dropped_count} of the input not in {control.source.name} became tie points: "
             f"{list_some(dropped)}"
         )
-    if missing_ids:
+    if unseen_ids:
         notes.append(
-            f"{control.source.name}: no photograph shows the points {list_some(missing_ids)}"
+            f"{control.source.name}: no photograph shows the points {list_some(unseen_ids)}"
         )
     return network.warn(*warnings).note(*notes)
 
 
 def _transform_into_frame(
-    network: Network, places: Int[np.ndarray, " n"], control: Points, settings: ControlFrameSettings
+    network: Network,
+    point_rows: Int[np.ndarray, " n"],
+    control: Points,
+    settings: ControlFrameSettings,
 ) -> Network:
-    """The network with start values transformed so that its points in the rows `places` are at the
+    """The network with start values transformed so that its points in `point_rows` are at the
     control points.
 
     **Raises:** `InputError` if they fit no similarity."""
@@ -279,9 +282,9 @@ def _transform_into_frame(
     # nothing to transform.
     if np.isfinite(images.sigma).any() or not np.isfinite(images.position).any():
         return network
-    source = points.position[places]
+    source = points.position[point_rows]
     if np.isnan(source).any():
-        source = _intersect(network, places)
+        source = _intersect_points(network, point_rows)
     is_known = np.isfinite(source).all(1)
     source, target = source[is_known], target[is_known]
     # Seven parameters of a similarity: three points give nine coordinates.
@@ -293,9 +296,9 @@ def _transform_into_frame(
     if np.median(np.linalg.norm(source - target, axis=1)) <= settings.max_offset * extent:
         return network
     A, t = transformation
-    misfit = np.linalg.norm(source @ A.T + t - target, axis=1)
+    deviations = np.linalg.norm(source @ A.T + t - target, axis=1)
     _check_similarity(
-        misfit, control.take(np.flatnonzero(is_known)), settings.max_misfit, network.object_unit
+        deviations, control.take(np.flatnonzero(is_known)), settings.max_misfit, network.object_unit
     )
     scale = float(np.cbrt(np.linalg.det(A)))  # A = scale·R, det R = 1
     if abs(abs(np.log(scale)) - np.log(1000)) < np.log(1 + settings.thousand_tolerance):
@@ -325,33 +328,34 @@ def _transform_into_frame(
 
 
 def _check_similarity(
-    misfit: Float[np.ndarray, " n"], control: Points, max_misfit: float, unit: str
+    deviations: Float[np.ndarray, " n"], control: Points, max_misfit: float, unit: str
 ) -> None:
-    """Refuse control that is `misfit` the similarity by more than `max_misfit` of its spread: the
+    """Refuse control that deviates from the similarity by more than `max_misfit` of its spread: the
     network would not be in its frame."""
-    extent = np.sqrt(np.square(control.position - control.position.mean(0)).sum(1).mean())
-    if np.median(misfit) > max_misfit * extent:
-        worst = (f"{control.id[k]!r} by {misfit[k]:.3g}" for k in np.argsort(-misfit))
+    rms_radius = np.sqrt(np.square(control.position - control.position.mean(0)).sum(1).mean())
+    if np.median(deviations) > max_misfit * rms_radius:
+        largest = (f"{control.id[k]!r} by {deviations[k]:.3g}" for k in np.argsort(-deviations))
         raise InputError(
             f"{control.source.name}: the control fits no similarity of the start values of the "
-            f"input: its {count(len(misfit), 'point')} are within {extent:.3g} {unit} of their "
-            "mean "
-            f"and {np.median(misfit):.3g} off (median), most of all {list_some(worst, 3, str)}; "
-            "check "
-            "names and units of the table, or leave out the start values of the input"
+            f"input: its {count(len(deviations), 'point')} are within {rms_radius:.3g} {unit} of "
+            f"their mean and {np.median(deviations):.3g} off (median), most of all "
+            f"{list_some(largest, 3, str)}; check names and units of the table, or leave out the "
+            "start values of the input"
         )
 
 
-def _intersect(network: Network, places: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+def _intersect_points(
+    network: Network, point_rows: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
     """The coordinates of points by the orientations of the input; NaN if there are none."""
     points = network.points
     roles = np.array(points.role, dtype=object)
-    position, free = points.position.copy(), np.full_like(points.sigma, np.nan)
-    roles[points.has_role("control", "fixed")], position[places] = "tie", np.nan
-    roles[places] = "tie"
+    position, no_sigma = points.position.copy(), np.full_like(points.sigma, np.nan)
+    roles[points.has_role("control", "fixed")], position[point_rows] = "tie", np.nan
+    roles[point_rows] = "tie"
     start = network.replace(
         points=dataclasses.replace(
-            points, role=tuple(roles.tolist()), position=position, sigma=free
+            points, role=tuple(roles.tolist()), position=position, sigma=no_sigma
         ),
         datum="inner",
         datum_points=(),
@@ -359,7 +363,7 @@ def _intersect(network: Network, places: Int[np.ndarray, " n"]) -> Float[np.ndar
     try:
         intersected = find_start_values(start).network.points
     except (InputError, NotSolvedError):
-        return position[places]
+        return position[point_rows]
     position_of = dict(zip(intersected.id, intersected.position))
-    nothing = np.full(3, np.nan)
-    return np.array([position_of.get(points.id[k], nothing) for k in places])
+    unknown_position = np.full(3, np.nan)
+    return np.array([position_of.get(points.id[k], unknown_position) for k in point_rows])

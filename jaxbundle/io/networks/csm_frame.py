@@ -116,8 +116,8 @@ def read_csm_frame(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         plane, X0, R, warnings = _framelets(isd, plane)
         names = [f"{path.stem}-{k:03d}" for k in range(len(X0))]
     else:
-        centre, turn, warnings = pose_at_centre(isd)
-        X0, R, names = centre[None], turn.as_matrix()[None], [path.stem]
+        centre, rotation, warnings = pose_at_centre(isd)
+        X0, R, names = centre[None], rotation.as_matrix()[None], [path.stem]
     camera = _camera(id, isd, plane)
     # From the body into our frame, of which the plane has the axes in the frame of the ISD.
     M = plane.axes @ np.swapaxes(R, 1, 2)
@@ -135,13 +135,13 @@ def _support_data(path: Path) -> tuple[JsonFields, UnknownKeys]:
         from jaxbundle.io.scanner.csm_state import frame_support_data_of
 
         # A state: the name of its model, then an object.
-        name, _, after_name = text.lstrip().partition("\n")
+        name, _, body = text.lstrip().partition("\n")
         if name.strip() != MODEL:
             raise InputError(
                 f"{path}: a model state of {show(name.strip()[:60])}; expected one of {MODEL}, or "
                 "support data (ISD)"
             )
-        state = JsonFields(path, read_object(path, after_name, "a model state"))
+        state = JsonFields(path, read_object(path, body, "a model state"))
         return JsonFields(path, frame_support_data_of(state)), unknown
     isd = JsonFields(path, read_object(path, text, "an ISD"))
     if isd.get("name_model") not in (MODEL, PUSH_FRAME):
@@ -160,7 +160,7 @@ def _framelets(
     top of the image; warnings."""
     from jaxbundle.io.scanner.csm_trajectory import poses_at
 
-    height, lines = isd.integer("framelet_height", least=1), plane.size[1]
+    height, lines = isd.integer("framelet_height", minimum=1), plane.size[1]
     if isd.number("detector_line_summing", 1.0) != 1:
         raise InputError(f"{isd.path}: detector_line_summing of framelets is not supported")
     flags = {
@@ -174,24 +174,30 @@ def _framelets(
             f"{isd.path}: framelets_flipped: the lines of every framelet are in reverse order, a "
             "mirror image, which no camera here has; turn them round and set it to false"
         )
-    number, lines_left = divmod(lines, height)
+    framelet_count, surplus_lines = divmod(lines, height)
     warnings = []
-    if lines_left:
+    if surplus_lines:
         warnings.append(
-            f"{isd.path}: {lines} lines are {number} framelets of {height} and {lines_left} more "
-            "lines, "
-            "which are left out"
+            f"{isd.path}: {lines} lines are {framelet_count} framelets of {height} and "
+            f"{surplus_lines} more lines, which are left out"
         )
-    if number == 0:
+    if framelet_count == 0:
         raise InputError(f"{isd.path}: {lines} lines are less than a framelet of {height}")
     delay = isd.number("interframe_delay")
     if not delay > 0:
         raise InputError(f"{isd.path}: interframe_delay is {delay:g}; expected seconds above 0")
-    k = np.arange(number)
+    k = np.arange(framelet_count)
     k = k[::-1] if flags["framelet_order_reversed"] else k
     first_time = isd.number("starting_ephemeris_time") + isd.number("exposure_duration") / 2
-    P, R, messages = poses_at(isd, first_time - isd.number("center_ephemeris_time") + k * delay)
-    return plane._replace(size=(plane.size[0], height)), P, R.as_matrix(), (*messages, *warnings)
+    P, R, pose_warnings = poses_at(
+        isd, first_time - isd.number("center_ephemeris_time") + k * delay
+    )
+    return (
+        plane._replace(size=(plane.size[0], height)),
+        P,
+        R.as_matrix(),
+        (*pose_warnings, *warnings),
+    )
 
 
 class FocalPlane(NamedTuple):
@@ -216,7 +222,7 @@ class FocalPlane(NamedTuple):
 
 def _focal_plane(isd: JsonFields) -> FocalPlane:
     f = isd.number("focal_length_model.focal_length")
-    size = (isd.integer("image_samples", least=1), isd.integer("image_lines", least=1))
+    size = (isd.integer("image_samples", minimum=1), isd.integer("image_lines", minimum=1))
     along_line, along_sample = (isd.array(f"focal2pixel_{k}", (3,)) for k in ("lines", "samples"))
     names = ("detector_sample_summing", "detector_line_summing")
     summing = np.array([isd.number(name, 1.0) for name in names])
@@ -232,17 +238,17 @@ def _focal_plane(isd: JsonFields) -> FocalPlane:
     to_mm = np.linalg.inv(A) * summing
     start = np.array([isd.number(f"starting_detector_{k}", 0.0) for k in ("sample", "line")])
     middle = np.array([isd.number(f"detector_center.{k}") for k in ("sample", "line")])
-    first_coordinates = np.array([along_sample[0], along_line[0]])
-    centre = (middle + first_coordinates - start) / summing - 0.5
+    offset = np.array([along_sample[0], along_line[0]])
+    centre = (middle + offset - start) / summing - 0.5
     if np.linalg.det(to_mm) * np.sign(f) < 0:
         raise InputError(
             f"{isd.path}: focal2pixel_lines and focal2pixel_samples make a mirror image, which no "
             "camera here has; mirror the image, and negate the coefficients of its lines"
         )
-    sample_direction = to_mm[:, 0] / np.linalg.norm(to_mm[:, 0])
+    x_axis = to_mm[:, 0] / np.linalg.norm(to_mm[:, 0])
     # y against the lines; of a plane with skew, at right angles to the samples
-    upward = np.array([sample_direction[1], -sample_direction[0]]) * np.sign(f)
-    axes = np.array([[*sample_direction, 0.0], [*upward, 0.0], [0.0, 0.0, -np.sign(f)]])
+    y_axis = np.array([x_axis[1], -x_axis[0]]) * np.sign(f)
+    axes = np.array([[*x_axis, 0.0], [*y_axis, 0.0], [0.0, 0.0, -np.sign(f)]])
     return FocalPlane(to_mm, centre, axes, size, abs(f))
 
 
@@ -255,7 +261,7 @@ def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
     numbers = lambda n: isd.array(f"{where}.coefficients", (n,))
     # The images of the axes of the plane in ours: the rows of `axes` without the third.
     Q, f = plane.axes[:2, :2], plane.focal_length
-    skewed = abs(plane.to_mm[:, 0] @ plane.to_mm[:, 1]) > 1e-9 * np.prod(plane.pixel_size)
+    is_skewed = abs(plane.to_mm[:, 0] @ plane.to_mm[:, 1]) > 1e-9 * np.prod(plane.pixel_size)
     focal: Mapping[str, float] = dict(
         fx=f / plane.pixel_size[0],
         fy=f / plane.pixel_size[1],
@@ -265,44 +271,46 @@ def _camera(id: str, isd: JsonFields, plane: FocalPlane) -> Camera:
     match kind:
         case "radial" | "cahvor":
             k = np.r_[numbers(None), np.zeros(6)]
-            number_known = 5 if kind == "cahvor" else 3
-            if k[number_known:].any():
+            term_count = 5 if kind == "cahvor" else 3
+            if k[term_count:].any():
                 raise InputError(
-                    f"{isd.path}: {where}: at most {number_known} coefficients are known"
+                    f"{isd.path}: {where}: at most {term_count} coefficients are known"
                 )
             offset = k[3:5] if kind == "cahvor" else np.zeros(2)
-            if skewed or offset.any():
+            if is_skewed or offset.any():
                 p = {"k": k[:3], "offset": offset}
                 return _fit(id, isd, plane, focal, image_of_radial, p, f"has the distortion {kind}")
-            return _corrected(id, plane, k[:3]) if k.any() else _opencv(id, plane, focal)
+            return (
+                _corrected_camera(id, plane, k[:3]) if k.any() else _opencv_camera(id, plane, focal)
+            )
         case "dawnfc" | "radtan":
             # k1, k2, p1, p2, k3 of x/f; a decentring (p2, p1) turns with the axes
             k1, k2, p1, p2, k3 = (
                 numbers(5) if kind == "radtan" else (numbers(1)[0] * f * f, 0, 0, 0, 0)
             )
-            turned = Q @ [p2, p1] * np.sign(-plane.axes[2, 2])
-            distortion = {"k1": k1, "k2": k2, "k3": k3, "p1": -turned[1], "p2": turned[0]}
-            if skewed:
+            decentring = Q @ [p2, p1] * np.sign(-plane.axes[2, 2])
+            coefficients = {"k1": k1, "k2": k2, "k3": k3, "p1": -decentring[1], "p2": decentring[0]}
+            if is_skewed:
                 raise InputError(f"{isd.path}: {where} with skewed pixels is not supported")
-            return _opencv(
-                id, plane, {**focal, **{name: float(v) for name, v in distortion.items()}}
+            return _opencv_camera(
+                id, plane, {**focal, **{name: float(v) for name, v in coefficients.items()}}
             )
         case "transverse":
             a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
             p = {"a": np.r_[a, np.zeros(10)][:10], "b": np.r_[b, np.zeros(10)][:10]}
-            why = "has the distortion transverse"
-            return _fit(id, isd, plane, focal, image_of_transverse, p, why)
+            reason = "has the distortion transverse"
+            return _fit(id, isd, plane, focal, image_of_transverse, p, reason)
     raise InputError(
         f"{isd.path}: optical_distortion {show(kind)} of a frame camera is not supported; "
         "expected radial, transverse, radtan, dawnfc or cahvor"
     )
 
 
-def _opencv(id: str, plane: FocalPlane, parameters: Mapping[str, float]) -> Camera:
+def _opencv_camera(id: str, plane: FocalPlane, parameters: Mapping[str, float]) -> Camera:
     return Camera(id, "opencv", parameters, image_size=plane.size, pixel_size=plane.pixel_size)
 
 
-def _corrected(id: str, plane: FocalPlane, k: Float[np.ndarray, "3"]) -> Camera:
+def _corrected_camera(id: str, plane: FocalPlane, k: Float[np.ndarray, "3"]) -> Camera:
     """Exactly `radial`, the correction of the measured point; `brown` without a linear term."""
     (w, h), (pw, ph) = plane.size, plane.pixel_size
     parameters = {
@@ -325,18 +333,18 @@ def _fit(
     start: Mapping[str, float],
     formula: Formula,
     p: Mapping[str, Float[np.ndarray, " n"]],
-    why: str,
+    reason: str,
 ) -> Camera:
     """The nearest camera: the pixels of rays by the formula of the ISD."""
-    isd_parameters = {
+    parameters = {
         "distortion": dict(p),
         "f": plane.focal_length,
         "axes": plane.axes[:2, :2],
         "to_pixel": np.linalg.inv(plane.to_mm),
         "centre": plane.centre,
     }
-    foreign = Foreign(formula, isd_parameters, start, plane.size, plane.pixel_size)
-    return fit_camera(id, foreign, str(isd.path), why)
+    foreign = Foreign(formula, parameters, start, plane.size, plane.pixel_size)
+    return fit_camera(id, foreign, str(isd.path), reason)
 
 
 def radial(k: Mapping[str, Array], u: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -365,15 +373,17 @@ def transverse(k: Mapping[str, Array], u: Float[Array, "2"]) -> Float[Array, "2"
 
 def image_of_radial(p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """The pixel of a ray (right, down, forward) by `radial`, or `cahvor`."""
-    return _image(radial, p, X, Y, Z)
+    return _pixel_of_ray(radial, p, X, Y, Z)
 
 
 def image_of_transverse(p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """The pixel of a ray (right, down, forward) by `transverse`."""
-    return _image(transverse, p, X, Y, Z)
+    return _pixel_of_ray(transverse, p, X, Y, Z)
 
 
-def _image(distort: Callable, p: Mapping, X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
+def _pixel_of_ray(
+    distort: Callable, p: Mapping, X: Scalar, Y: Scalar, Z: Scalar
+) -> Float[Array, "2"]:
     # Our axes are x right, y up: a ray (X, Y) has −Y along the second.
     u = p["f"] / Z * (X * p["axes"][0] - Y * p["axes"][1])
     return p["to_pixel"] @ distort(p["distortion"], u) + p["centre"]

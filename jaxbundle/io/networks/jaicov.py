@@ -56,11 +56,11 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file and line.
     """
     path = Path(path)
-    beside = {suffix: path.with_suffix(suffix) for suffix in COMPANION_SUFFIXES}
-    cameras = _cameras(beside[".ior"])
-    images, angles, position, camera, messages = _images(beside[".eor"])
-    points, coordinates, datum = _points(beside[".obc"])
-    rays, lines, ray_messages = _rays(path, points if beside[".obc"].is_file() else None)
+    companions = {suffix: path.with_suffix(suffix) for suffix in COMPANION_SUFFIXES}
+    cameras = _cameras(companions[".ior"])
+    images, angles, position, camera, messages = _images(companions[".eor"])
+    points, coordinates, datum = _points(companions[".obc"])
+    rays, lines, ray_messages = _rays(path, points if companions[".obc"].is_file() else None)
     for image in rays["image"]:
         images.setdefault(image, len(images))
     for point in rays["point"]:
@@ -68,7 +68,7 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     # Images and points that only the image points name follow those of .eor and .obc, as unknown.
     X0, all_angles = np.full((2, len(images), 3), np.nan)
     X0[: len(position)], all_angles[: len(angles)] = position, angles
-    camera_of_image = camera + [str(next(iter(cameras)))] * (len(images) - len(camera))
+    camera_ids = camera + [str(next(iter(cameras)))] * (len(images) - len(camera))
     X = np.full((len(points), 3), np.nan)
     X[: len(coordinates)] = coordinates
     network = assemble(
@@ -78,30 +78,30 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ),
         overrides,
         image_columns(
-            Source(str(beside[".eor"]), None, "image"),
+            Source(str(companions[".eor"]), None, "image"),
             list(images),
-            camera_of_image,
+            camera_ids,
             matrices_of(all_angles),
             X0,
         ),
         Columns(
             {"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", X.T))},
-            Source(str(beside[".obc"]), None, "point"),
+            Source(str(companions[".obc"]), None, "point"),
         ),
         Columns(rays, Source(str(path), np.array(lines, np.int64), "line")),
         (*messages, *ray_messages),
     )
-    return _with_distances(network, beside[".scale"])
+    return _with_distances(network, companions[".scale"])
 
 
 def _cameras(file: Path) -> dict[str, dict]:
     """The entries of cameras by number."""
     rows, cameras = TextRows(file, comment="#"), {}
-    while rows.more():
+    while rows.has_more():
         entry, first_row = {}, None
         for names in INTERIOR:
             row = rows.take(f"{', '.join(names)} of a camera")
-            entry |= dict(zip(names, row.numbers(names, more=True).tolist()))
+            entry |= dict(zip(names, row.numbers(names, allow_more=True).tolist()))
             first_row = first_row or row
         assert first_row is not None
         size = entry["columns"], entry["rows"]
@@ -134,28 +134,27 @@ def _images(
 ]:
     """Row of each image, angles, positions, cameras, and messages."""
     images: dict[str, int] = {}
-    angles, position, camera, other_order = [], [], [], []
+    angles, position, camera, unread_ids = [], [], [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
         names = ("X0", "Y0", "Z0", "omega", "phi", "kappa", "order", "active", "state")
-        entry = dict(zip(names, row.numbers(names, 2, more=True).tolist()))
+        entry = dict(zip(names, row.numbers(names, 2, allow_more=True).tolist()))
         if entry["active"] == 0:
             continue
         _number_row(row, images, "image")
         # Order 0: ω, φ, κ; state 1: not oriented, 2: approximately, 3: by bundle adjustment.
-        good = entry["order"] == 0 and entry["state"] != 1
+        is_oriented = entry["order"] == 0 and entry["state"] != 1
         if entry["order"] != 0:
-            other_order.append(row.words[0])
-        values = [entry[name] if good else np.nan for name in names[:6]]
+            unread_ids.append(row.words[0])
+        values = [entry[name] if is_oriented else np.nan for name in names[:6]]
         position.append(values[:3])
         angles.append(values[3:])
         camera.append(row.words[1])
     messages = (
         [
-            f"{count(len(other_order), 'image')} whose rotation is of another order than 0: "
-            "without "
-            f"orientation: {list_some(other_order)}"
+            f"{count(len(unread_ids), 'image')} whose rotation is of another order than 0: without "
+            f"orientation: {list_some(unread_ids)}"
         ]
-        if other_order
+        if unread_ids
         else []
     )
     return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, messages)
@@ -166,7 +165,7 @@ def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[
     points: dict[str, int] = {}
     coordinates, datum = [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
-        values = row.numbers(("X", "Y", "Z"), 1, more=True)
+        values = row.numbers(("X", "Y", "Z"), 1, allow_more=True)
         # Short rows, of coordinates alone or with σ, are active points outside the datum.
         if len(row) >= 11 and row.words[8] == "0":
             continue
@@ -177,9 +176,9 @@ def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[
     return points, np.reshape(coordinates, (-1, 3)), datum
 
 
-def _number_row(row: TextRow, table: dict[str, int], noun: str) -> None:
+def _number_row(row: TextRow, table: dict[str, int], kind: str) -> None:
     if row.words[0] in table:
-        raise row.error(f"{noun} {row.words[0]} occurs twice")
+        raise row.error(f"{kind} {row.words[0]} occurs twice")
     table[row.words[0]] = len(table)
 
 
@@ -191,7 +190,7 @@ def _rays(
     lines, unknown = [], []
     names = ("x", "y", "sx", "sy", "vx", "vy", "method", "active")
     for row in TextRows(file, comment="#"):
-        values = row.numbers(names, 2, more=True)
+        values = row.numbers(names, 2, allow_more=True)
         image, point = row.words[:2]
         if values[-1] <= 0:
             continue
@@ -216,18 +215,18 @@ def _with_distances(network: Network, file: Path) -> Network:
     ends, values = [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
         # The name stands in quotes and may have blanks.
-        words_after = TextRow(
+        values_row = TextRow(
             row.path,
             row.number,
             row.text.rpartition('"')[2] if '"' in row.text else " ".join(row.words[1:]),
         )
-        length, sigma, active = words_after.numbers(("length", "σ", "active"), 2, more=True)
+        length, sigma, active = values_row.numbers(("length", "σ", "active"), 2, allow_more=True)
         # An end that was left out above leaves nothing to measure.
-        if active == 0 or not {*words_after.words[:2]} <= {*index}:
+        if active == 0 or not {*values_row.words[:2]} <= {*index}:
             continue
         if not (length > 0 and sigma > 0):
             raise row.error("length and σ must be positive")
-        ends.append([index[id] for id in words_after.words[:2]])
+        ends.append([index[id] for id in values_row.words[:2]])
         values.append((length, sigma))
         lines.append(row.number)
     if not ends:
@@ -279,15 +278,15 @@ def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
         ],
     }
     with replace_files(*content) as temporary:
-        for place, lines in zip(temporary, content.values()):
-            place.write_bytes("".join(f"{line}\n" for line in lines).encode())
+        for temporary_path, lines in zip(temporary, content.values()):
+            temporary_path.write_bytes("".join(f"{line}\n" for line in lines).encode())
     return describe_losses(network, JAICOV_LOSSES)
 
 
 def _numbers(ids: Sequence[str]) -> list[str]:
     # 18 digits fit in 64 bits
-    plain = all(id.isascii() and id.isdigit() and len(id) < 19 for id in ids)
-    return list(ids) if plain else [str(k) for k in range(1, len(ids) + 1)]
+    are_numbers = all(id.isascii() and id.isdigit() and len(id) < 19 for id in ids)
+    return list(ids) if are_numbers else [str(k) for k in range(1, len(ids) + 1)]
 
 
 # What it loses; names of cameras and images are numbers.
@@ -295,13 +294,13 @@ JAICOV_LOSSES = losing(
     "colours of points",
     keeping=("distances", "σ of image points", "datum points"),
     partly={
-        "names of cameras": lambda n: _renumbered([camera.id for camera in n.cameras]),
-        "names of images": lambda n: _renumbered(n.images.id),
+        "names of cameras": lambda n: _count_renumbered([camera.id for camera in n.cameras]),
+        "names of images": lambda n: _count_renumbered(n.images.id),
     },
 )
 
 
-def _renumbered(ids: Sequence[str]) -> int:
+def _count_renumbered(ids: Sequence[str]) -> int:
     return changed(ids, _numbers(ids))
 
 

@@ -129,7 +129,7 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     chain = {
         id: JsonFields(f"{path}, {id}", document[id])
         # By number: cam10 after cam9.
-        for id in sorted(filter(CAMERA_KEY.fullmatch, document), key=_number)
+        for id in sorted(filter(CAMERA_KEY.fullmatch, document), key=_camera_number)
         if isinstance(document[id], dict)
     }
     if not chain:
@@ -151,25 +151,25 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 def _poses(chain: Sequence[JsonFields]) -> tuple[Float[np.ndarray, "cameras 4 4"], list[str]]:
     """From the frame of the first camera to that of each, NaN where the file does not tell; of a
     single camera from the body. Messages about what is not read."""
-    body = [_body_pose(fields) for fields in chain]
+    body_poses = [_body_pose(fields) for fields in chain]
     poses = np.full((len(chain), 4, 4), np.nan)
     if len(chain) == 1:
-        poses[0] = np.nan if body[0] is None else body[0]
+        poses[0] = np.nan if body_poses[0] is None else body_poses[0]
         return poses, []
     poses[0] = np.eye(4)
     for k, fields in enumerate(chain[1:], 1):
         # A chain may be broken and go on through the body.
         if fields.get("T_cn_cnm1") is not None:
             poses[k] = _transform(fields, "T_cn_cnm1") @ poses[k - 1]
-    for k, pose_in_body in enumerate(body):
-        known_poses = (
-            (other_pose, poses[j])
-            for j, other_pose in enumerate(body)
-            if other_pose is not None and j != k and np.isfinite(poses[j]).all()
+    for k, body_pose in enumerate(body_poses):
+        candidates = (
+            (other_body_pose, poses[j])
+            for j, other_body_pose in enumerate(body_poses)
+            if other_body_pose is not None and j != k and np.isfinite(poses[j]).all()
         )
-        if pose_in_body is not None and np.isnan(poses[k]).any():
-            for other_pose, place in known_poses:
-                poses[k] = pose_in_body @ np.linalg.inv(other_pose) @ place
+        if body_pose is not None and np.isnan(poses[k]).any():
+            for other_body_pose, other_pose in candidates:
+                poses[k] = body_pose @ np.linalg.inv(other_body_pose) @ other_pose
                 break
     for k, fields in enumerate(chain[1:], 1):
         if fields.get("T_cn_cnm1") is not None and np.isnan(poses[k]).any():
@@ -205,7 +205,7 @@ def _transform(fields: JsonFields, key: str) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def _number(id: str) -> int:
+def _camera_number(id: str) -> int:
     digits = id.removeprefix("cam")
     return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 9 else -1
 
@@ -214,22 +214,29 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     kind = fields.text("camera_model", "pinhole"), fields.text("distortion_model", "none").lower()
     kind = kind[0], DISTORTION_NAMES.get(kind[1], kind[1])
     if kind not in READ_MODELS:
-        known_models = ", ".join("-".join(names) for names in READ_MODELS)
+        choices = ", ".join("-".join(names) for names in READ_MODELS)
         raise InputError(
             f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; expected one "
-            f"of {known_models}"
+            f"of {choices}"
         )
     model, core, coefficients = READ_MODELS[kind]
     values = fields.array("intrinsics", (len(core),))
-    spelled = next((k for k in COEFFICIENT_KEYS if fields.get(k) is not None), COEFFICIENT_KEYS[0])
-    distortion = fields.array(spelled, (len(coefficients),)) if coefficients else ()
-    if not coefficients and np.any(fields.get(spelled) or 0):
-        raise InputError(f"{fields.path}: {spelled} of distortion_model none; expected none")
+    coefficient_key = next(
+        (k for k in COEFFICIENT_KEYS if fields.get(k) is not None), COEFFICIENT_KEYS[0]
+    )
+    coefficient_values = fields.array(coefficient_key, (len(coefficients),)) if coefficients else ()
+    if not coefficients and np.any(fields.get(coefficient_key) or 0):
+        raise InputError(
+            f"{fields.path}: {coefficient_key} of distortion_model none; expected none"
+        )
     w, h = fields.array("resolution", (2,))
     size = JsonFields(f"{fields.path}: resolution", {"w": w, "h": h})
-    parameters = dict(zip((*core, *coefficients), map(float, (*values, *distortion))))
+    parameters = dict(zip((*core, *coefficients), map(float, (*values, *coefficient_values))))
     return Camera(
-        id, model, parameters, image_size=(size.integer("w", least=1), size.integer("h", least=1))
+        id,
+        model,
+        parameters,
+        image_size=(size.integer("w", minimum=1), size.integer("h", minimum=1)),
     )
 
 
@@ -244,8 +251,8 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
     if mountings is None and len(network.cameras) > 1:
         losses.append("mountings of the cameras")
     for k, original in enumerate(network.cameras):
-        camera, fit_messages_of_camera = _fit(original)
-        losses += fit_messages_of_camera
+        camera, fit_losses = _fit_radtan_or_equi(original)
+        losses += fit_losses
         lines += [f"cam{k}:", *(f"  {line}" for line in _camera_lines(camera, k))]
         if mountings is not None and k:
             lines += [
@@ -256,41 +263,41 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
     return (*describe_losses(network, KALIBR_LOSSES), *losses)
 
 
-def _fit(camera: Camera) -> tuple[Camera, list[str]]:
+def _fit_radtan_or_equi(camera: Camera) -> tuple[Camera, list[str]]:
     """A camera with more coefficients than Kalibr's radtan as the nearest radtan or equi, and the
     difference in words."""
     p = all_parameters(camera)
-    unwritable = [name for name, value in p.items() if value and name not in (*CORE, *RADTAN)]
-    if camera.model != "opencv" or not unwritable:
+    extra_names = [name for name, value in p.items() if value and name not in (*CORE, *RADTAN)]
+    if camera.model != "opencv" or not extra_names:
         return camera, []
     size, fits, reason = size_of(camera, "Kalibr"), [], ""
-    for target, free in (("opencv", (*CORE, *RADTAN)), ("kannala-brandt", ())):
+    for target, free_names in (("opencv", (*CORE, *RADTAN)), ("kannala-brandt", ())):
         try:
             fits.append(
                 convert_camera(
-                    get_model("opencv"), p, get_model(target), image_size=size, free=free
+                    get_model("opencv"), p, get_model(target), image_size=size, free=free_names
                 )
             )
         except ValueError as error:
             reason = reason or str(error)
     if not fits:
-        raise InputError(f"camera {camera.id!r}: Kalibr has no {', '.join(unwritable)}: {reason}")
+        raise InputError(f"camera {camera.id!r}: Kalibr has no {', '.join(extra_names)}: {reason}")
     best = min(fits, key=lambda fit: fit.rms)
     message = (
-        f"{', '.join(unwritable)} of camera {camera.id!r}, fitted as "
+        f"{', '.join(extra_names)} of camera {camera.id!r}, fitted as "
         f"{'radtan' if best.model == 'opencv' else 'equi'} over the image: largest difference "
         f"{best.largest:.3g} px, RMS {best.rms:.3g} px (none if the rig is calibrated without)"
     )
-    fitted = dataclasses.replace(camera, model=best.model, parameters=dict(best.parameters))
-    return fitted, [message]
+    fitted_camera = dataclasses.replace(camera, model=best.model, parameters=dict(best.parameters))
+    return fitted_camera, [message]
 
 
 def _camera_lines(camera: Camera, k: int) -> list[str]:
     """The entries of a camera, by the first model of Kalibr that holds it."""
     p, (w, h) = all_parameters(camera), size_of(camera, "Kalibr")
     for (kind, distortion), (model, core, coefficients) in MODELS.items():
-        written_names = {*core, *coefficients}
-        if model == camera.model and not any(p[name] for name in p if name not in written_names):
+        parameter_names = {*core, *coefficients}
+        if model == camera.model and not any(p[name] for name in p if name not in parameter_names):
             values = join_numbers((p[name] for name in coefficients), ", ")
             return [
                 f"camera_model: {kind}",
@@ -300,15 +307,15 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
                 f"resolution: [{w}, {h}]",
                 f"rostopic: /cam{k}/image_raw",
             ]
-    known_names = [names for model, *names in MODELS.values() if model == camera.model]
-    if not known_names:
+    parameter_sets = [names for model, *names in MODELS.values() if model == camera.model]
+    if not parameter_sets:
         raise InputError(
             f"camera {camera.id!r}: Kalibr has no model {str(camera.model)!r}; convert it with "
             "--model opencv"
         )
-    all_names = {name for names in known_names for part in names for name in part}
-    unwritable = ", ".join(name for name, value in p.items() if value and name not in all_names)
-    raise InputError(f"camera {camera.id!r}: Kalibr has no {unwritable}; adjust the camera without")
+    kalibr_names = {name for names in parameter_sets for part in names for name in part}
+    excess = ", ".join(name for name, value in p.items() if value and name not in kalibr_names)
+    raise InputError(f"camera {camera.id!r}: Kalibr has no {excess}; adjust the camera without")
 
 
 def mountings_of(
@@ -330,16 +337,16 @@ def mountings_of(
     # One image of every camera, as a file of cameras is read, is a moment too.
     if not moments and len(images) == number:
         moments = {0: list(range(number))}
-    complete_rigs = [
+    complete_moments = [
         rows
         for rows in moments.values()
         if len({*images.camera[rows].tolist()}) == number == len(rows)
     ]
-    if not complete_rigs or not np.isfinite(images.position[complete_rigs[0]]).all():
+    if not complete_moments or not np.isfinite(images.position[complete_moments[0]]).all():
         return None
     # Only the orientations that are written must be there.
-    need_values(network.replace(images=images.take(np.array(complete_rigs[0]))), points=False)
-    rows = np.array(complete_rigs[0])[np.argsort(images.camera[complete_rigs[0]])]
+    need_values(network.replace(images=images.take(np.array(complete_moments[0]))), points=False)
+    rows = np.array(complete_moments[0])[np.argsort(images.camera[complete_moments[0]])]
     R, t = cv_pose(matrices_of(images.angles[rows]), images.position[rows])
     T = np.tile(np.eye(4), (number - 1, 1, 1))
     T[:, :3, :3] = R[1:] @ R[:-1].transpose(0, 2, 1)
@@ -357,16 +364,16 @@ def _lost_orientations(network: Network) -> int:
 def mounted_losses(names: Callable[[Network], Sequence[str]] | None = None) -> Losses:
     """The losses of a format of cameras and their mountings, whose images have the names of the
     cameras; `names`: other ones that cameras are given."""
-    names_written = names or (lambda n: [camera.id for camera in n.cameras])
+    written_names = names or (lambda n: [camera.id for camera in n.cameras])
     return losing(
         "pixel sizes of cameras",
         "points",
         partly={
             "orientations of images": _lost_orientations,
             "rigs": lambda n: QUANTITIES["rigs"](n) if mountings_of(n) is None else 0,
-            "names of images": lambda n: len({*n.images.id} - {*names_written(n)}),
+            "names of images": lambda n: len({*n.images.id} - {*written_names(n)}),
             **(
-                {"names of cameras": lambda n: changed([c.id for c in n.cameras], names_written(n))}
+                {"names of cameras": lambda n: changed([c.id for c in n.cameras], written_names(n))}
                 if names
                 else {}
             ),

@@ -37,10 +37,10 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
         (images, images.angles, "image", "orientation"),
         (object_points, object_points.position, "point", "coordinates"),
     ]
-    for table, values, noun, quantity in tables[: 3 if points else 2]:
+    for table, values, name, quantity in tables[: 3 if points else 2]:
         for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
             raise InputError(
-                f"{table.source(row)}: {noun} {table.id[row]!r} has no {quantity} to be written: "
+                f"{table.source(row)}: {name} {table.id[row]!r} has no {quantity} to be written: "
                 "convert the result of jaxbundle orient or adjust, which compute what is missing"
             )
 
@@ -134,12 +134,14 @@ def losing(
     unknown = {*names, *partly, *keeping} - QUANTITIES.keys()
     if unknown:
         raise ValueError(f"unknown quantities: {', '.join(sorted(unknown))}")
-    hidden = {part for name in lost_names if name not in partly for part in PARTS.get(name, ())}
+    implied_names = {
+        part for name in lost_names if name not in partly for part in PARTS.get(name, ())
+    }
     return MappingProxyType(
         {
             name: partly.get(name, QUANTITIES[name])
             for name in QUANTITIES
-            if name in lost_names - hidden
+            if name in lost_names - implied_names
         }
     )
 
@@ -150,15 +152,17 @@ def describe_losses(network: Network, losses: Losses) -> tuple[str, ...]:
     return tuple(f"{name} ({number})" for name, number in numbers.items() if number)
 
 
-def changed(names: Sequence[str], names_written: Sequence[object]) -> int:
+def changed(names: Sequence[str], written_names: Sequence[object]) -> int:
     """How many names are written as something else."""
-    return sum(name != str(new) for name, new in zip(names, names_written, strict=True))
+    return sum(name != str(new) for name, new in zip(names, written_names, strict=True))
 
 
 def written_numbers(ids: Sequence[str]) -> list[int]:
     """The ids if all are numbers, else 0, 1, 2, …"""
-    plain = all(id.isascii() and id.isdigit() and len(id) < 10 and str(int(id)) == id for id in ids)
-    return [int(id) for id in ids] if plain else list(range(len(ids)))
+    are_numbers = all(
+        id.isascii() and id.isdigit() and len(id) < 10 and str(int(id)) == id for id in ids
+    )
+    return [int(id) for id in ids] if are_numbers else list(range(len(ids)))
 
 
 def are_numbered_from_0(ids: Sequence[str]) -> bool:
@@ -176,9 +180,11 @@ def check_others_zero(camera: Camera, format: str, coefficients: Sequence[str]) 
     if camera.model not in PIXEL_MODELS:
         raise InputError(f"{where} model {str(camera.model)!r}; convert it with --model opencv")
     p = all_parameters(camera)
-    not_zero = [name for name, value in p.items() if value and name not in (*CORE, *coefficients)]
-    if not_zero:
-        raise InputError(f"{where} {', '.join(not_zero)}; adjust the camera without")
+    superfluous = [
+        name for name, value in p.items() if value and name not in (*CORE, *coefficients)
+    ]
+    if superfluous:
+        raise InputError(f"{where} {', '.join(superfluous)}; adjust the camera without")
     return p
 
 

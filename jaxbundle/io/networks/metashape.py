@@ -126,21 +126,21 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     unknown = UnknownKeys()
-    chunk, ties, messages = _chunk(path, unknown)
+    chunk, ties, archive_messages = _chunk(path, unknown)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     cameras = [camera for camera in chunk.iterfind("cameras//camera")]
     for camera in cameras:
         unknown.check_element(camera, CAMERA_KEYS, f"{path}, camera {label_of(camera)!r}")
     used_cameras = [
-        c for c in cameras if _true(c.get("enabled")) and c.find("transform") is not None
+        c for c in cameras if _is_true(c.get("enabled")) and c.find("transform") is not None
     ]
     aligned = bool(used_cameras)
     if not aligned:
-        marked_cameras = {
+        marked_ids = {
             e.get("camera_id") for e in chunk.iterfind("frames/frame/markers/marker/location")
         }
         used_cameras = [
-            c for c in cameras if _true(c.get("enabled")) and c.get("id") in marked_cameras
+            c for c in cameras if _is_true(c.get("enabled")) and c.get("id") in marked_ids
         ]
     if not used_cameras:
         raise InputError(
@@ -148,13 +148,13 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             "aligned, and none has a measured marker; expected cameras with a <transform>, or "
             "markers with locations"
         )
-    left_out = [label_of(c) for c in cameras if c not in used_cameras]
+    omitted_labels = [label_of(c) for c in cameras if c not in used_cameras]
     for id in dict.fromkeys(camera.get("sensor_id") for camera in used_cameras):
         if id in sensors:
             where = f"{path}, sensor {label_of(sensors[id])!r}"
             check_sensor(unknown, sensors[id], where)
-    entries, all_messages = _entries(path, sensors, used_cameras)
-    all_messages = [*messages, *all_messages]
+    entries, messages = _entries(path, sensors, used_cameras)
+    messages = [*archive_messages, *messages]
     used_cameras = [camera for camera in used_cameras if camera.get("sensor_id") in entries]
     labels = unique_labels(
         [label_of(c) for c in used_cameras], [c.get("id", "") for c in used_cameras]
@@ -179,44 +179,45 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if ties is not None:
         points, rays = _with_ties(path, chunk, ties, by_id, points, rays)
     document = foreign_document(path.stem, entries.values(), object_unit="m")
-    if left_out:
-        why = "not aligned" if aligned else "without a measured marker"
-        subject = f"left out {count(len(left_out), 'camera')} that are disabled or {why}"
-        all_messages.append(f"{subject}: {list_some(left_out)}")
+    if omitted_labels:
+        reason = "not aligned" if aligned else "without a measured marker"
+        omission = f"left out {count(len(omitted_labels), 'camera')} that are disabled or {reason}"
+        messages.append(f"{omission}: {list_some(omitted_labels)}")
     network = assemble(path, document, overrides, images, points, rays)
     if control is not None:
         network = with_control(network, control, datum=not choose_datum(overrides))
     if not aligned:
-        all_messages.append(
-            "the cameras are not aligned: orientations and coordinates are computed"
-        )
-    return network.warn(*all_messages, *_about_references(chunk, control), *unknown.messages())
+        messages.append("the cameras are not aligned: orientations and coordinates are computed")
+    return network.warn(*messages, *_describe_references(chunk, control), *unknown.messages())
 
 
 def _entries(
     path: Path, sensors: Mapping[str | None, ET.Element], used_cameras: Sequence[ET.Element]
 ) -> tuple[dict[str | None, dict[str, Any]], list[str]]:
     """The entries of the sensors of the photographs, by id, and messages about them."""
-    entries, messages, refusals = {}, [], {}
+    entries, messages, errors = {}, [], {}
     for camera in used_cameras:
         id = camera.get("sensor_id")
         if id not in sensors:
             raise InputError(
                 f"{path}, camera {label_of(camera)!r}: sensor {id!r} is not in the file"
             )
-        if id in entries or id in refusals:
+        if id in entries or id in errors:
             continue
         try:
             entries[id], sensor_messages = sensor_camera(path, sensors[id])
             messages += sensor_messages
         except NoPlaceError as error:
-            refusals[id] = error
-    for id, error in refusals.items():
+            errors[id] = error
+    for id, error in errors.items():
         if not entries:
             raise error
-        left_out = [label_of(c) for c in used_cameras if c.get("sensor_id") == id]
-        why = str(error).removeprefix(f"{path}, ")
-        messages.append(f"{why}; left out {count(len(left_out), 'camera')}: {list_some(left_out)}")
+        omitted_labels = [label_of(c) for c in used_cameras if c.get("sensor_id") == id]
+        reason = str(error).removeprefix(f"{path}, ")
+        messages.append(
+            f"{reason}; left out {count(len(omitted_labels), 'camera')}: "
+            f"{list_some(omitted_labels)}"
+        )
     return entries, messages
 
 
@@ -245,30 +246,30 @@ def _pose(
     """M and X0, in the chunk's frame or, if it has a transform, in that of the world."""
     T = numbers_of(f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
     to_chunk, centre = T[:3, :3], T[:3, 3]
-    R, t, scale = _to_world(where, chunk, camera.get("component_id"))
+    R, t, scale = _similarity_to_world(where, chunk, camera.get("component_id"))
     to_chunk, centre = R @ to_chunk, scale * (R @ centre) + t
     check_rotations(to_chunk, f"{where}: the transform")
     return flip_rows(to_chunk.T), centre
 
 
-def _to_world(
+def _similarity_to_world(
     where: str, chunk: ET.Element, component: str | None
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
     """R, t and s of X = s·R·x + t, from the frame of a chunk or of a component of it; the identity
     where there is no transform."""
-    holder = next(
+    component_element = next(
         (c for c in chunk.iterfind("components/component") if c.get("id") == component), None
     )
-    transform = None if holder is None else holder.find("transform")
+    transform = None if component_element is None else component_element.find("transform")
     transform = chunk.find("transform") if transform is None else transform
     if transform is not None and (transform.text or "").strip():
         raise InputError(f"{where}: the transform of the chunk has no <rotation>, as old versions")
     if transform is None or transform.find("rotation") is None:
         return np.eye(3), np.zeros(3), 1.0
-    place = f"{where}, transform of the chunk"
-    R = numbers_of(f"{place}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
-    t = numbers_of(f"{place}, translation", transform.findtext("translation"), 3)
-    return R, t, number_in(transform.findtext("scale", ""), f"{place}, scale")
+    location = f"{where}, transform of the chunk"
+    R = numbers_of(f"{location}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
+    t = numbers_of(f"{location}, translation", transform.findtext("translation"), 3)
+    return R, t, number_in(transform.findtext("scale", ""), f"{location}, scale")
 
 
 def _with_ties(
@@ -284,34 +285,32 @@ def _with_ties(
     X = np.empty_like(ties.position)
     for component in dict.fromkeys(ties.component.tolist()):
         rows = np.array([tie_component == component for tie_component in ties.component.tolist()])
-        R, t, scale = _to_world(f"{path}, tie points", chunk, component)
+        R, t, scale = _similarity_to_world(f"{path}, tie points", chunk, component)
         X[rows] = scale * ties.position[rows] @ R.T + t
-    is_known = np.array([camera in images for camera in ties.camera.tolist()], bool)
-    is_known &= np.isin(ties.track, ties.id)
-    xy = ties.xy[is_known] - PIXEL_CENTRE
+    is_used = np.array([camera in images for camera in ties.camera.tolist()], bool)
+    is_used &= np.isin(ties.track, ties.id)
+    xy = ties.xy[is_used] - PIXEL_CENTRE
     names = [f"t{id}" for id in ties.id.tolist()]
-    points_made = {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", X.T))}
-    points_made |= colour_columns(ties.colour)
-    rays_made = {
-        "image": [images[camera] for camera in ties.camera[is_known].tolist()],
-        "point": [f"t{id}" for id in ties.track[is_known].tolist()],
+    tie_points = {"id": names, "role": ["tie"] * len(names), **dict(zip("XYZ", X.T))}
+    tie_points |= colour_columns(ties.colour)
+    tie_rays = {
+        "image": [images[camera] for camera in ties.camera[is_used].tolist()],
+        "point": [f"t{id}" for id in ties.track[is_used].tolist()],
         "x": xy[:, 0],
         "y": xy[:, 1],
     }
-    return _join_columns(points, points_made, path), _join_columns(rays, rays_made, path)
+    return _append_rows(points, tie_points, path), _append_rows(rays, tie_rays, path)
 
 
-def _join_columns(
-    first_table: Columns | None, further_columns: Mapping[str, Any], path: Path
-) -> Columns:
-    """The rows of a table, followed by others; columns that the first does not have are empty
-    there."""
-    if first_table is None:
-        return Columns(dict(further_columns), Source(str(path), None, "tie point"))
+def _append_rows(table: Columns | None, appended: Mapping[str, Any], path: Path) -> Columns:
+    """The rows of a table, if there is one, followed by others; a column that it does not have is
+    empty in its rows."""
+    if table is None:
+        return Columns(dict(appended), Source(str(path), None, "tie point"))
     return Columns(
         {
-            name: [*first_table.values.get(name, [None] * len(first_table)), *column]
-            for name, column in further_columns.items()
+            name: [*table.values.get(name, [None] * len(table)), *column]
+            for name, column in appended.items()
         },
         Source(str(path), None, "point"),
     )
@@ -328,7 +327,7 @@ def _markers(
         if id not in markers:
             raise InputError(f"{path}: marker {id!r} of a frame is not among the markers")
         for location in marker.iterfind("location"):
-            if location.get("camera_id") not in images or not _true(location.get("valid")):
+            if location.get("camera_id") not in images or not _is_true(location.get("valid")):
                 continue
             where = f"{path}, marker {label_of(markers[id])!r}, camera {location.get('camera_id')}"
             x, y = (number_in(location.get(k, ""), f"{where}, {k}") for k in "xy")
@@ -344,16 +343,16 @@ def _markers(
             unique_labels([label_of(markers[id]) for id in marker_ids], list(marker_ids)),
         )
     )
-    blank = [None] * len(marker_ids)
+    empty_column = [None] * len(marker_ids)
     image, point, x, y = zip(*rows)
     return (
         Columns(
             {
                 "id": list(names.values()),
                 "role": ["tie"] * len(marker_ids),
-                "X": blank,
-                "Y": blank,
-                "Z": blank,
+                "X": empty_column,
+                "Y": empty_column,
+                "Z": empty_column,
             },
             Source(str(path), None, "marker"),
         ),
@@ -377,28 +376,28 @@ def _references(path: Path, chunk: ET.Element, markers: Mapping[str, ET.Element]
             continue
         where = f"{path}, reference of marker {id!r}"
         ids.append(id)
-        roles.append("control" if _true(reference.get("enabled")) else "check")
+        roles.append("control" if _is_true(reference.get("enabled")) else "check")
         position.append([number_in(reference.get(k, ""), f"{where}, {k}") for k in "xyz"])
         sigma.append(
             [
-                number_in(reference.get(k, str(_accuracy(chunk))), f"{where}, {k}")
+                number_in(reference.get(k, str(_marker_accuracy(chunk))), f"{where}, {k}")
                 for k in ("sx", "sy", "sz")
             ]
         )
     # Fewer than three points do not determine the seven parameters of a datum.
     if roles.count("control") < 3:
         return None
-    sigma = np.where(np.array(sigma) > 0, sigma, _accuracy(chunk))
+    sigma = np.where(np.array(sigma) > 0, sigma, _marker_accuracy(chunk))
     return Points(tuple(ids), tuple(roles), np.array(position), sigma, Source(str(path)))
 
 
-def _about_references(chunk: ET.Element, control: Points | None) -> Iterator[str]:
+def _describe_references(chunk: ET.Element, control: Points | None) -> Iterator[str]:
     """Messages about the references of markers."""
     if control is not None:
         yield (
-            f"{count(len(control), 'marker')} with reference coordinates: control points with "
-            f"σ as the file gives it, else {_accuracy(chunk):g} m; those not enabled are check "
-            "points"
+            f"{count(len(control), 'marker')} with reference coordinates: control points with σ "
+            f"as the file gives it, else {_marker_accuracy(chunk):g} m; those not enabled are "
+            "check points"
         )
     elif not _is_local(chunk) and chunk.find("markers//marker/reference") is not None:
         yield (
@@ -413,7 +412,7 @@ def _is_local(chunk: ET.Element) -> bool:
     return (chunk.findtext("reference") or LOCAL).strip().upper().startswith(LOCAL)
 
 
-def _accuracy(chunk: ET.Element) -> float:
+def _marker_accuracy(chunk: ET.Element) -> float:
     for element in chunk.iterfind("settings/property"):
         if element.get("name") == "accuracy_markers":
             try:
@@ -425,6 +424,6 @@ def _accuracy(chunk: ET.Element) -> float:
     return 0.005  # m, the default of Metashape's settings
 
 
-def _true(word: str | None) -> bool:
+def _is_true(word: str | None) -> bool:
     """Whether an attribute is not switched off; old versions write 0 and 1."""
     return (word or "true").lower() not in ("false", "0")

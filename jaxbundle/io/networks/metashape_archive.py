@@ -70,23 +70,23 @@ def read_archive(path: Path) -> ChunkArchive:
     chunk."""
     root = read_xml(path)
     # The name of the project is that of the file, however it was renamed.
-    place = root.get("path") or "{projectname}.files/project.zip"
-    project = path.parent / place.replace("{projectname}", path.stem)
+    relative_path = root.get("path") or "{projectname}.files/project.zip"
+    project = path.parent / relative_path.replace("{projectname}", path.stem)
     document = document_of(project, _members(project, path), PROJECT)
     chunks = {chunk.get("id"): chunk.get("path") for chunk in document.iterfind("chunks/chunk")}
-    holder = document.find("chunks")
-    active = None if holder is None else holder.get("active_id")
-    active_chunk = active if active in chunks else next(iter(chunks), None)
-    if not chunks.get(active_chunk):
+    chunks_element = document.find("chunks")
+    active = None if chunks_element is None else chunks_element.get("active_id")
+    chunk_id = active if active in chunks else next(iter(chunks), None)
+    if not chunks.get(chunk_id):
         raise InputError(f"{project}: {PROJECT} without a chunk")
     messages = []
     if len(chunks) > 1:
-        other_chunks = [id or "?" for id in chunks if id != active_chunk]
+        other_ids = [id or "?" for id in chunks if id != chunk_id]
         messages.append(
-            f"chunk {active_chunk}, the active one, is read; not read: "
-            f"{list_some(other_chunks, as_text=str)}"
+            f"chunk {chunk_id}, the active one, is read; not read: "
+            f"{list_some(other_ids, as_text=str)}"
         )
-    archive = project.parent / str(chunks[active_chunk])
+    archive = project.parent / str(chunks[chunk_id])
     # Its frames are changed below.
     chunk = copy.deepcopy(document_of(archive, _members(archive, path), PROJECT))
     if chunk.tag != "chunk":
@@ -95,16 +95,16 @@ def read_archive(path: Path) -> ChunkArchive:
     if len(frames) > 1:
         messages.append(f"the first of {len(frames)} frames is read")
     ties = None
-    holder = chunk.find("frames")
+    frames_element = chunk.find("frames")
     for frame in frames[1:]:
-        if holder is not None:
-            holder.remove(frame)
+        if frames_element is not None:
+            frames_element.remove(frame)
     if frames and frames[0].get("path"):
-        frame_file = archive.parent / str(frames[0].get("path"))
-        frame_document = document_of(frame_file, _members(frame_file, path), PROJECT)
+        frame_archive = archive.parent / str(frames[0].get("path"))
+        frame_document = document_of(frame_archive, _members(frame_archive, path), PROJECT)
         # As an export has it: the markers with their image points.
         frames[0].extend(frame_document.findall("markers"))
-        ties = _ties(frame_file.parent / "point_cloud" / "point_cloud.zip", path)
+        ties = _ties(frame_archive.parent / "point_cloud" / "point_cloud.zip", path)
     return ChunkArchive(chunk, ties, tuple(messages))
 
 
@@ -143,9 +143,9 @@ def _ties(archive: Path, project: Path) -> TieTable | None:
     entry = document.find("tracks")
     if entry is not None and entry.get("path") in members:
         table = _vertices(archive, members, entry, ("red", "green", "blue"))
-        is_known = (ids >= 0) & (ids < len(table))
+        has_track = (ids >= 0) & (ids < len(table))
         for axis, name in enumerate(("red", "green", "blue")):
-            colour[is_known, axis] = table[name][ids[is_known]]
+            colour[has_track, axis] = table[name][ids[has_track]]
     return TieTable(
         ids,
         np.concatenate(component),

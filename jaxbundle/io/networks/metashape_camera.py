@@ -82,8 +82,8 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
     where = f"{path}, sensor {label!r}"
     kinds = sensor.findall("calibration")
     if sensor.get("type") == SPHERICAL:
-        return _sphere(where, label, sensor), ()
-    kinds = kinds or _nominal(where, sensor)
+        return _spherical_camera(where, label, sensor), ()
+    kinds = kinds or _nominal_calibration(where, sensor)
     if not kinds:
         raise NoPlaceError(f"{where}: there is no <calibration>")
     calibration = next((c for c in kinds if c.get("class") == "adjusted"), kinds[0])
@@ -94,7 +94,7 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
                 f"{where}: sensors of type {show(name)} are not offered; these are: "
                 f"{', '.join((*TYPES, SPHERICAL))}"
             )
-    w, h = _size(where, sensor if calibration.find("resolution") is None else calibration)
+    w, h = _image_size(where, sensor if calibration.find("resolution") is None else calibration)
     p = _coefficients(where, calibration, w, h)
     values = {
         "fx": p["f"] + p["b1"],
@@ -111,14 +111,12 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
     decentred = p["p1"] != 0 or p["p2"] != 0  # p3 and p4 are factors of these terms
     if kind == "frame":
         values |= {"p1": p["p2"], "p2": p["p1"]}
-        other_parameters = {
-            name: p[name] for name in ("k4", "b2", *(("p3", "p4") if decentred else ()))
-        }
+        extra_terms = {name: p[name] for name in ("k4", "b2", *(("p3", "p4") if decentred else ()))}
     else:
         values |= {"k4": p["k4"]}
-        other_parameters = {name: p[name] for name in ("p1", "p2", "b2")}
-    other_parameters = {name: value for name, value in other_parameters.items() if value != 0}
-    if not other_parameters and "equisolid" not in kind:
+        extra_terms = {name: p[name] for name in ("p1", "p2", "b2")}
+    extra_terms = {name: value for name, value in extra_terms.items() if value != 0}
+    if not extra_terms and "equisolid" not in kind:
         return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, ()
     foreign = Foreign(
         FORMULAS[kind],
@@ -128,21 +126,21 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict[str, Any], tuple
         _pixel_size(where, sensor),
         kind != "frame",
     )
-    fitted_entry, fit = nearest_camera(foreign, where)
-    has = "".join(f"{name} {value:g}, " for name, value in other_parameters.items()).rstrip(", ")
-    why = f"has {has}" if has else "is equisolid"
-    return entry | fitted_entry, (f"sensor {label!r} {why}: {fit}",)
+    fitted, fit = nearest_camera(foreign, where)
+    terms_text = "".join(f"{name} {value:g}, " for name, value in extra_terms.items()).rstrip(", ")
+    reason = f"has {terms_text}" if terms_text else "is equisolid"
+    return entry | fitted, (f"sensor {label!r} {reason}: {fit}",)
 
 
-def _sphere(where: str, label: str, sensor: ET.Element) -> dict[str, Any]:
+def _spherical_camera(where: str, label: str, sensor: ET.Element) -> dict[str, Any]:
     """u = w/2 + f·atan2(X, Z), v = h/2 + f·atan2(Y, √(X² + Z²)), f = w/(2π)."""
-    w, h = _size(where, sensor)
+    w, h = _image_size(where, sensor)
     f = w / (2 * np.pi)
     core = {"fx": f, "fy": f, "cx": w / 2 - PIXEL_CENTRE, "cy": h / 2 - PIXEL_CENTRE}
     return {"id": label, "image_size": [w, h], "model": "equirectangular", **core}
 
 
-def _nominal(where: str, sensor: ET.Element) -> list[ET.Element]:
+def _nominal_calibration(where: str, sensor: ET.Element) -> list[ET.Element]:
     """The calibration that the properties of a sensor give before an alignment: f from the focal
     length and the pixel size in mm."""
     properties = {e.get("name"): e.get("value") for e in sensor.iterfind("property")}
@@ -155,8 +153,8 @@ def _nominal(where: str, sensor: ET.Element) -> list[ET.Element]:
     return [calibration] if focal > 0 else []
 
 
-def _size(where: str, holder: ET.Element) -> tuple[float, float]:
-    size = holder.find("resolution")
+def _image_size(where: str, element: ET.Element) -> tuple[float, float]:
+    size = element.find("resolution")
     if size is None:
         raise InputError(f"{where}: there is no <resolution>")
     w, h = (number_in(size.get(k, ""), f"{where}, resolution, {k}") for k in ("width", "height"))
@@ -166,22 +164,26 @@ def _size(where: str, holder: ET.Element) -> tuple[float, float]:
 def _coefficients(where: str, calibration: ET.Element, w: float, h: float) -> dict[str, float]:
     """All coefficients in the current form."""
     tags = [element.tag for element in calibration]
-    twice = next((tag for tag in (*COEFFICIENTS, *OLD_COEFFICIENTS) if tags.count(tag) > 1), None)
-    if twice:
-        raise InputError(f"{where}: <{twice}> occurs twice")
+    repeated_tag = next(
+        (tag for tag in (*COEFFICIENTS, *OLD_COEFFICIENTS) if tags.count(tag) > 1), None
+    )
+    if repeated_tag:
+        raise InputError(f"{where}: <{repeated_tag}> occurs twice")
     values = {
         element.tag: number_in(element.text or "", f"{where}, {element.tag}")
         for element in calibration
         if element.tag in (*COEFFICIENTS, *OLD_COEFFICIENTS)
     }
     old = "f" not in values and "fy" in values
-    wrong = ("f", "b1", "b2") if old else OLD_COEFFICIENTS
-    if mixed := [tag for tag in wrong if values.get(tag)]:
+    foreign_tags = ("f", "b1", "b2") if old else OLD_COEFFICIENTS
+    if mixed_tags := [tag for tag in foreign_tags if values.get(tag)]:
         raise InputError(
-            f"{where}: {', '.join(mixed)} beside {'fy' if old else 'f'}; expected f, b1 and b2, or "
-            "fx, fy and skew"
+            f"{where}: {', '.join(mixed_tags)} beside {'fy' if old else 'f'}; expected f, b1 and "
+            "b2, or fx, fy and skew"
         )
-    p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in values.items() if k not in wrong}
+    p = dict.fromkeys(COEFFICIENTS, 0.0) | {
+        k: v for k, v in values.items() if k not in foreign_tags
+    }
     if old:
         fy = p.pop("fy")
         p |= {
@@ -235,9 +237,9 @@ def _project_metashape(
         x, y = X * scale, Y * scale
     r2 = x * x + y * y
     radial = 1 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * (p["k3"] + r2 * p["k4"])))
-    higher_order = 1 + r2 * (p["p3"] + r2 * p["p4"])
-    xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * higher_order
-    yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * higher_order
+    tangential_factor = 1 + r2 * (p["p3"] + r2 * p["p4"])
+    xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * tangential_factor
+    yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * tangential_factor
     u = p["w"] / 2 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"]
     return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - PIXEL_CENTRE
 

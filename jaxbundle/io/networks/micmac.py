@@ -76,7 +76,7 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     if not files:
         raise InputError(f"{path}: there is no {FILES[0]} in it")
     cameras: dict[Path, Camera] = {}
-    names, camera_of_image, rotations, centres = [], [], [], []
+    names, camera_ids, rotations, centres = [], [], [], []
     unknown = UnknownKeys()
     for file in files:
         xml = XmlFields(file, read_xml(file), "an orientation of MicMac")
@@ -90,32 +90,32 @@ def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             cameras[where] = calibration(where, root, id)
         C2W, X0 = _pose(xml)
         names.append(file.stem.removeprefix(ORIENTATION))
-        camera_of_image.append(cameras[where].id)
+        camera_ids.append(cameras[where].id)
         rotations.append(C2W.T)  # world → camera, as R of x = R·X + t
         centres.append(X0)
     images = image_columns(
         Source(str(path), None, "file"),
         names,
-        camera_of_image,
+        camera_ids,
         flip_rows(np.array(rotations)),
         np.array(centres),
     )
-    network_document = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
+    project_document = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
     messages = (*fit_messages(cameras.values()), *unknown.messages())
-    return assemble(path, network_document, overrides, images, warnings=messages)
+    return assemble(path, project_document, overrides, images, warnings=messages)
 
 
 def _calibration(file: Path, xml: XmlFields) -> tuple[Path, ET.Element]:
     """The file of the calibration of an image, and its document."""
     if xml.find("FileInterne") is None:
         if xml.find("Interne") is None:
-            raise xml.missing("FileInterne")
+            raise xml.missing_error("FileInterne")
         return file, xml.root
     name = xml.text("FileInterne")
-    places = (file.parent / name, file.parent.parent / name, file.parent / Path(name).name)
-    for place in places:
-        if os.path.isfile(place):  # also of names too long for a file
-            return place, read_xml(place)
+    candidates = (file.parent / name, file.parent.parent / name, file.parent / Path(name).name)
+    for candidate in candidates:
+        if os.path.isfile(candidate):  # also of names too long for a file
+            return candidate, read_xml(candidate)
     raise InputError(f"{file}: FileInterne {name}: there is no such file beside it, nor above")
 
 
@@ -124,22 +124,22 @@ def _pose(xml: XmlFields) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
     kind = xml.text("TypeProj", "eProjStenope")
     external = xml.find("Externe")
     if external is None:
-        raise xml.missing("Externe")
-    external_orientation = XmlFields(xml.path, external, xml.kind)
-    convention = external_orientation.text("KnownConv", xml.text("ConvOri/KnownConv", M2C[0]))
-    for name, value, supported in (
+        raise xml.missing_error("Externe")
+    external_xml = XmlFields(xml.path, external, xml.kind)
+    convention = external_xml.text("KnownConv", xml.text("ConvOri/KnownConv", M2C[0]))
+    for name, value, choices in (
         ("TypeProj", kind, ("eProjStenope",)),
         ("KnownConv", convention, (*M2C, *C2M)),
     ):
-        if value not in supported:
-            raise InputError(f"{xml.path}: {name} is {value}; expected {', '.join(supported)}")
+        if value not in choices:
+            raise InputError(f"{xml.path}: {name} is {value}; expected {', '.join(choices)}")
     if xml.find("OrIntImaM2C") is not None:
         for name, expected in IDENTITY.items():
             if tuple(xml.numbers(f"OrIntImaM2C/{name}", 2)) != expected:
                 raise InputError(f"{xml.path}: OrIntImaM2C must be the identity, but {name} is not")
-    rows = [external_orientation.numbers(f"ParamRotation/CodageMatr/L{i}", 3) for i in (1, 2, 3)]
+    rows = [external_xml.numbers(f"ParamRotation/CodageMatr/L{i}", 3) for i in (1, 2, 3)]
     check_rotations(np.array(rows), f"{xml.path}: CodageMatr")
-    return np.array(rows), external_orientation.numbers("Centre", 3)
+    return np.array(rows), external_xml.numbers("Centre", 3)
 
 
 def write_micmac(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:
@@ -174,7 +174,7 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
         write_text(folder / f"{CALIBRATION}{id}.xml", text)
     for k, id in enumerate(images.id):
         camera = network.cameras[images.camera[k]].id
-        lines = _orientation(f"{CALIBRATION}{camera}.xml", C2W[k], images.position[k])
+        lines = _orientation_lines(f"{CALIBRATION}{camera}.xml", C2W[k], images.position[k])
         write_text(folder / f"{ORIENTATION}{id}.xml", document(lines))
     return describe_losses(network, MICMAC_LOSSES)
 
@@ -183,7 +183,9 @@ def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
 MICMAC_LOSSES = losing("pixel sizes of cameras", "points")
 
 
-def _orientation(file: str, C2W: Float[np.ndarray, "3 3"], X0: Float[np.ndarray, "3"]) -> list[str]:
+def _orientation_lines(
+    file: str, C2W: Float[np.ndarray, "3 3"], X0: Float[np.ndarray, "3"]
+) -> list[str]:
     rows = [f"<L{i}>{join_numbers(row)}</L{i}>" for i, row in enumerate(C2W, 1)]
     return [
         "<OrientationConique>",

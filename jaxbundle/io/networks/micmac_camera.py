@@ -104,36 +104,34 @@ def calibration(path: Path, root: ET.Element, id: str, pixel_size: float = 0.005
     **Arguments:** `pixel_size` [mm] of a model in mm, since the file has none. Any value gives the
     same image; 5 µm is a common one, so that c in mm looks like that of a lens.
     """
-    document_fields = XmlFields(path, root, "a calibration of MicMac")
+    root_fields = XmlFields(path, root, "a calibration of MicMac")
     # Tapas writes it inside <ExportAPERO>, other tools as the root
-    calibration_element = root if root.tag == CALIBRATION else document_fields.find(CALIBRATION)
-    if calibration_element is None:
-        raise document_fields.missing(CALIBRATION)
-    xml = XmlFields(path, calibration_element, "a calibration of MicMac")
+    element = root if root.tag == CALIBRATION else root_fields.find(CALIBRATION)
+    if element is None:
+        raise root_fields.missing_error(CALIBRATION)
+    xml = XmlFields(path, element, "a calibration of MicMac")
     unknown = UnknownKeys()
-    _check_keys(unknown, path, calibration_element)
-    camera = _calibrated(path, xml, id, pixel_size)
+    _check_keys(unknown, path, element)
+    camera = _camera_of_calibration(path, xml, id, pixel_size)
     return with_messages(camera, *unknown.messages())
 
 
-def _check_keys(unknown: UnknownKeys, path: Path, calibration_element: ET.Element) -> None:
-    unknown.check_element(calibration_element, KEYS, f"{path}: {CALIBRATION}")
-    if any(
-        float(e.text or 0) for e in calibration_element.iter("ParamAF") if is_number(e.text or "")
-    ):
+def _check_keys(unknown: UnknownKeys, path: Path, element: ET.Element) -> None:
+    unknown.check_element(element, KEYS, f"{path}: {CALIBRATION}")
+    if any(float(e.text or 0) for e in element.iter("ParamAF") if is_number(e.text or "")):
         raise InputError(f"{path}: ParamAF, an afocal system, is not supported")
-    for distortion in calibration_element.iter("CalibDistortion"):
+    for distortion in element.iter("CalibDistortion"):
         unknown.check_element(distortion, DISTORTION_KEYS, f"{path}: CalibDistortion")
         for tag, keys in KIND_KEYS.items():
             for part in distortion.iter(tag):
                 unknown.check_element(part, keys, f"{path}: {tag}")
 
 
-def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camera:
+def _camera_of_calibration(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camera:
     direction = xml.text("KnownConv", M2C[0])
     if direction not in (*M2C, *C2M):
-        known_directions = ", ".join((*M2C, *C2M))
-        raise InputError(f"{path}: KnownConv is {direction}; expected one of {known_directions}")
+        choices = ", ".join((*M2C, *C2M))
+        raise InputError(f"{path}: KnownConv is {direction}; expected one of {choices}")
     if xml.find("OrIntGlob") is not None:
         raise InputError(f"{path}: OrIntGlob, a separate affine part, is not supported")
     f, (cx, cy), (w, h) = xml.number("F"), xml.numbers("PP", 2), xml.numbers("SzIm", 2)
@@ -151,35 +149,35 @@ def _calibrated(path: Path, xml: XmlFields, id: str, pixel_size: float) -> Camer
     p = core | _distortion(xml, core)
     start = core | {f"k{i}": p[f"R{i}"] * f ** (2 * i) for i in (1, 2, 3)}
     start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
-    odd = {
+    unusual_features = {
         "more than three coefficients": p["R4"] or p["R5"],
         # Equal to the last bit: MicMac writes one number twice (PPaEqPPs).
         "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"]),
     }
-    has = " and ".join(feature for feature, is_there in odd.items() if is_there)
+    features_text = " and ".join(
+        feature for feature, is_present in unusual_features.items() if is_present
+    )
     size = int(w), int(h)
-    if has:
+    if features_text:
         foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (pixel_size, pixel_size))
-        return fit_camera(id, foreign, str(path), f"has {has}")
+        return fit_camera(id, foreign, str(path), f"has {features_text}")
     # Without affinity, or any distortion of the other direction, the formulas are the same.
     if not (p["b1"] or p["b2"] or (direction in C2M and any(p[name] for name in COEFFICIENTS))):
         return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
-    model, pixel_size_words = (
-        MODELS[1 + (direction in C2M)],
-        f"the pixel size is taken as {pixel_size:g} mm",
-    )
+    model, note = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {pixel_size:g} mm"
     return FittedCamera(
         id,
         model,
-        _in_mm(p, size, pixel_size),
+        _parameters_in_mm(p, size, pixel_size),
         image_size=size,
         pixel_size=(pixel_size, pixel_size),
-        told=f"camera {id!r} is {model}, which is in mm: {pixel_size_words}; in pixels it changes "
-        "nothing",
+        message=f"camera {id!r} is {model}, which is in mm: {note}; in pixels it changes nothing",
     )
 
 
-def _in_mm(p: Mapping[str, float], size: tuple[int, int], pixel: float) -> dict[str, float]:
+def _parameters_in_mm(
+    p: Mapping[str, float], size: tuple[int, int], pixel: float
+) -> dict[str, float]:
     """The parameters of Brown's model in mm, y up."""
     radial = {f"K{i}": p[f"R{i}"] / pixel ** (2 * i) for i in (1, 2, 3)}
     x0, y0 = (pixel * (p[c] - (n - 1) / 2) for c, n in zip(("cx", "cy"), size))
@@ -199,7 +197,7 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
     """R1 … R5, the centre x, y, and P1, P2, b1, b2, of the only distortion other than ModNoDist.
 
     **Raises:** `InputError` for an unsupported kind, and for several."""
-    no_distortion = dict.fromkeys(COEFFICIENTS, 0.0)
+    zeros = dict.fromkeys(COEFFICIENTS, 0.0)
     kinds = [kind for part in xml.root.iter("CalibDistortion") for kind in part]
     kinds = [kind for kind in kinds if kind.tag != "ModNoDist"]
     for kind in kinds:
@@ -210,18 +208,18 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
                 + f" of {len(kinds)}; expected one of ModNoDist, ModRad, ModPhgrStd, ModUnif"
             )
     if not kinds:
-        return no_distortion | {"x": core["cx"], "y": core["cy"]}
+        return zeros | {"x": core["cx"], "y": core["cy"]}
     part = XmlFields(xml.path, kinds[0], f"a {kinds[0].tag} of MicMac")
     x, y = part.numbers("CDist", 2)
     R = [number_in(e.text or "", f"{xml.path}: CoeffDist") for e in kinds[0].iter("CoeffDist")]
     if any(R[len(RADIAL) :]):
         raise InputError(f"{xml.path}: {len(R)} coefficients CoeffDist; {len(RADIAL)} are known")
-    coefficients = no_distortion | dict(zip(RADIAL, R))
+    coefficients = zeros | dict(zip(RADIAL, R))
     coefficients |= {name: part.number(name, 0.0) for name in AFFINE}
     return coefficients | {"x": float(x), "y": float(y)}
 
 
-def _distort(p: Parameters, x: Scalar, y: Scalar) -> Pair:
+def _distortion_at(p: Parameters, x: Scalar, y: Scalar) -> Pair:
     """D of a point, relative to the centre of distortion."""
     R1, R2, R3, R4, R5, P1, P2, b1, b2 = p
     r2 = x * x + y * y
@@ -232,10 +230,10 @@ def _distort(p: Parameters, x: Scalar, y: Scalar) -> Pair:
 
 # Twelve iterations, as in `cameras.fisheye_prism`: Newton's method starts at the point itself and
 # converges quadratically; more only take time.
-_from_world = implicit_inverse(_distort, lambda _, x, y: (x, y), 12)
+_from_world = implicit_inverse(_distortion_at, lambda _, x, y: (x, y), 12)
 
 
-def _image(
+def _project(
     direction: Formula, p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar
 ) -> Float[Array, "2"]:
     """The image of a ray: `direction` maps from the ideal image."""
@@ -245,7 +243,7 @@ def _image(
 
 
 # Where the distortion leads to the camera, and where it leads to the world.
-FORMULAS = (partial(_image, _distort), partial(_image, _from_world))
+FORMULAS = (partial(_project, _distortion_at), partial(_project, _from_world))
 
 
 def calibration_lines(camera: Camera) -> list[str]:

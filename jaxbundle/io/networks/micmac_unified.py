@@ -57,18 +57,18 @@ def unified_camera(
             f"{xml.path}: ModUnif {kind or 'without TypeModele'} is not supported; expected one "
             f"of {', '.join(FORMULAS)}: calibrate again with one of them, or with Fraser"
         )
-    formula, states, number_used = FORMULAS[kind]
+    formula, states, parameter_count = FORMULAS[kind]
     if len(S) < states:
         raise InputError(f"{xml.path}: {kind} needs {states} Etats, but has {len(S)}")
-    if any(V[number_used:]):
+    if any(V[parameter_count:]):
         raise InputError(
-            f"{xml.path}: {kind}: only the first {number_used} Params are supported, but others "
-            "are not 0"
+            f"{xml.path}: {kind}: only the first {parameter_count} Params are supported, but "
+            "others are not 0"
         )
     if states and not S[0] > 0:
         raise InputError(f"{xml.path}: {kind}: the first of Etats must be positive, not {S[0]:g}")
     # Coefficients that are missing are 0.
-    V = (V + [0.0] * number_used)[:number_used]
+    V = (V + [0.0] * parameter_count)[:parameter_count]
     fisheye, start = "FishEye" in kind, dict(core)
     if fisheye:
         start = {"fx": S[0], "fy": S[0], "cx": V[0], "cy": V[1]}

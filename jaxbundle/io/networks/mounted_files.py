@@ -68,7 +68,7 @@ def read_vins(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         camera = read_slam_yaml(file)
         cameras.append(dataclasses.replace(camera, id=number))
         poses.append(_from_body(path, f"body_T_{number}", fields.get(f"body_T_{number}")))
-    return _rig(path, cameras, poses, overrides, unknown.messages())
+    return _mounted_network(path, cameras, poses, overrides, unknown.messages())
 
 
 def is_euroc(path: Path) -> bool:
@@ -86,7 +86,7 @@ def read_euroc(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(f"{path}: there is no cam0/{SENSOR} in it")
     cameras = [read_opencv(file) for file in files]
     poses = [_from_body(file, PLACE, read_entries(file).get(PLACE)) for file in files]
-    return _rig(path, cameras, poses, overrides)
+    return _mounted_network(path, cameras, poses, overrides)
 
 
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
@@ -104,12 +104,14 @@ def _from_body(path: Path, key: str, value: object) -> Pose:
     return T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
 
 
-def _rig(
+def _mounted_network(
     path: Path,
     cameras: Sequence[Camera],
     poses: Sequence[Pose],
     overrides: Sequence[str],
     messages: Sequence[str] = (),
 ) -> Network:
-    turns, shifts = zip(*poses)
-    return rig_network(path, cameras, turns, shifts, overrides, (*fit_messages(cameras), *messages))
+    rotations, shifts = zip(*poses)
+    return rig_network(
+        path, cameras, rotations, shifts, overrides, (*fit_messages(cameras), *messages)
+    )

@@ -153,20 +153,20 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     kind = name.removeprefix(PREFIX)
     size = fields.array("imagersize", (2,))
     sizes = JsonFields(f"{fields.path}: imagersize", dict(zip("wh", size.tolist())))
-    w, h = sizes.integer("w", least=1), sizes.integer("h", least=1)
-    model, coefficients = MODELS.get(kind, ("", CAHVOR if kind == "CAHVOR" else None))
+    w, h = sizes.integer("w", minimum=1), sizes.integer("h", minimum=1)
+    model, lens_names = MODELS.get(kind, ("", CAHVOR if kind == "CAHVOR" else None))
     if knots := SPLINE.fullmatch(kind):
         model = "spline-{}x{}-{}".format(*knots.groups())
-        coefficients = model_of(model, f"{fields.path}: lensmodel {name[:80]}: ").parameters[
+        lens_names = model_of(model, f"{fields.path}: lensmodel {name[:80]}: ").parameters[
             len(CORE) :
         ]
-    if coefficients is None:
+    if lens_names is None:
         raise InputError(
             f"{fields.path}: lensmodel {name} is not offered here; these are: "
             f"{', '.join(MODELS)}, CAHVOR, SPLINED_STEREOGRAPHIC_order=3_…"
         )
-    values = fields.array("intrinsics", (len(CORE) + len(coefficients),)).tolist()
-    p = dict(zip((*CORE, *coefficients), values))
+    values = fields.array("intrinsics", (len(CORE) + len(lens_names),)).tolist()
+    p = dict(zip((*CORE, *lens_names), values))
     if model:
         return Camera(id, model, p, image_size=(w, h))
     s = 1 + p["r0"]
@@ -196,10 +196,10 @@ def cahvor(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Ar
     a, b = p["alpha"], p["beta"]
     o = jnp.stack([jnp.sin(a) * jnp.cos(b), jnp.sin(b), jnp.cos(a) * jnp.cos(b)])
     ray = jnp.stack([X, Y, Z])
-    depth = ray @ o
-    off_axis = ray - depth * o
-    tau = (off_axis @ off_axis) / depth**2
-    x, y, z = ray + (p["r0"] + tau * (p["r1"] + tau * p["r2"])) * off_axis
+    axial = ray @ o
+    lateral = ray - axial * o
+    tau = (lateral @ lateral) / axial**2
+    x, y, z = ray + (p["r0"] + tau * (p["r1"] + tau * p["r2"])) * lateral
     return jnp.stack([p["fx"] * x / z + p["cx"], p["fy"] * y / z + p["cy"]])
 
 
@@ -210,9 +210,7 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
     """
     p, (w, h) = all_parameters(camera), size_of(camera, "mrcal")
     kinds = {
-        kind: coefficients
-        for kind, (model, coefficients) in MODELS.items()
-        if model == camera.model
+        kind: lens_names for kind, (model, lens_names) in MODELS.items() if model == camera.model
     }
     if knots := OUR_SPLINE.fullmatch(str(camera.model)):
         kind = "SPLINED_STEREOGRAPHIC_order=3_Nx={}_Ny={}_fov_x_deg={}".format(*knots.groups())
@@ -224,8 +222,8 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
         )
     kind = next(
         kind
-        for kind, coefficients in kinds.items()
-        if not any(p[name] for name in p if name not in (*CORE, *coefficients))
+        for kind, lens_names in kinds.items()
+        if not any(p[name] for name in p if name not in (*CORE, *lens_names))
     )
     numbers = lambda values: f"[ {join_numbers(values, ', ')} ]"
     return (
@@ -256,9 +254,11 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     R, t = cv_pose(matrices_of(images.angles), images.position)
     rt = np.concatenate([rotation_vectors_of(R), t], 1)
     names = [id.replace("/", "_") for id in images.id]
-    twice = next((name for name in names if names.count(name) > 1 or not name.strip(".")), None)
-    if twice is not None:
-        raise InputError(f"{folder}: image {twice!r} does not give a unique file name")
+    ambiguous_name = next(
+        (name for name in names if names.count(name) > 1 or not name.strip(".")), None
+    )
+    if ambiguous_name is not None:
+        raise InputError(f"{folder}: image {ambiguous_name!r} does not give a unique file name")
     texts = [model_text(network.cameras[c], pose) for c, pose in zip(images.camera, rt)]
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, texts):

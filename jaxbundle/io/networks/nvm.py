@@ -60,7 +60,7 @@ class _Model:
     def __init__(self, rows: TextRows, number: int):
         self.cameras = [rows.take(f"camera {k} of {number}") for k in range(number)]
         self.points: list[TextRow] = []
-        if rows.more():
+        if rows.has_more():
             points = rows.take("the number of points").integer(0, "the number of points")
             self.points = [rows.take(f"point {k} of {points}") for k in range(points)]
 
@@ -83,7 +83,7 @@ def read_nvm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
                 "a model without it"
             )
     models = []
-    while rows.more() and (row := rows.take("the number of cameras")).words:
+    while rows.has_more() and (row := rows.take("the number of cameras")).words:
         # After the models: comments about PLY files.
         if not row.words[0].isdigit() or not row.integer(0, "the number of cameras"):
             break
@@ -124,25 +124,24 @@ def _network(
         for name, f, r in zip(names, c.tolist(), p[:, 8].tolist())
     ]
     position, colours, rays = _points(model, len(names))
-    first_rows = {}
+    unique_rays = {}
     for k, (image, point, *_) in enumerate(rays[:, :2].astype(np.int64).tolist()):
-        first_rows.setdefault((image, point), k)
-    if len(first_rows) < len(rays):
-        subject = count(len(rays) - len(first_rows), "image point")
+        unique_rays.setdefault((image, point), k)
+    if len(unique_rays) < len(rays):
+        omitted = count(len(rays) - len(unique_rays), "image point")
         messages = [
             *messages,
-            f"left out {subject} of object points that have another in the same image",
+            f"left out {omitted} of object points that have another in the same image",
         ]
-        rays = rays[list(first_rows.values())]
+        rays = rays[list(unique_rays.values())]
     source = Source(str(path), rays[:, 4].astype(np.int64), "line")
     offset = _offset_of_centre(rays, position, M, p)
     if offset.any():
-        median_offset = ", ".join(f"{x:.2f}" for x in np.median(offset, axis=0))
+        centre = ", ".join(f"{x:.2f}" for x in np.median(offset, axis=0))
         messages = [
             *messages,
             "image points are counted from a corner of the images, as other programs than "
-            f"VisualSFM write them: their centres, ({median_offset}) px, are where the points fit "
-            "best",
+            f"VisualSFM write them: their centres, ({centre}) px, are where the points fit best",
         ]
     xy = (rays[:, 2:4] - offset[rays[:, 0].astype(np.int64)]) * [PIXEL, -PIXEL]
     return assemble(
@@ -176,25 +175,26 @@ def _offset_of_centre(
 
     **Arguments:** `tolerance`: relative to the image; the offset is half an image or none. Offsets
     of images that differ by less are one, those of images of other sizes differ by more."""
-    no_offset, xy = np.zeros((len(p), 2)), rays[:, 2:4]
+    zero_offsets, xy = np.zeros((len(p), 2)), rays[:, 2:4]
     if not len(xy) or xy.min() < 0:
-        return no_offset
+        return zero_offsets
     image, point = rays[:, :2].astype(np.int64).T
     r, s, q = np.einsum("nij,nj->in", M[image], position[point] - p[image, 5:8])
     with np.errstate(divide="ignore", invalid="ignore"):
-        misclosure = xy - p[image, :1] * np.stack([-r / q, s / q], 1)
-    misclosure[~np.isfinite(misclosure).all(1)] = np.nan
+        offsets = xy - p[image, :1] * np.stack([-r / q, s / q], 1)
+    offsets[~np.isfinite(offsets).all(1)] = np.nan
     if (
-        np.isnan(misclosure).all()
-        or (median_of_all := np.nanmedian(misclosure, axis=0)).min() < tolerance * xy.max()
+        np.isnan(offsets).all()
+        or (common_offset := np.nanmedian(offsets, axis=0)).min() < tolerance * xy.max()
     ):
-        return no_offset
-    by_image = [misclosure[image == k] for k in range(len(p))]
-    by_image = [
-        median_of_all if np.isnan(rows).all() else np.nanmedian(rows, axis=0) for rows in by_image
+        return zero_offsets
+    image_offsets = [offsets[image == k] for k in range(len(p))]
+    image_offsets = [
+        common_offset if np.isnan(rows).all() else np.nanmedian(rows, axis=0)
+        for rows in image_offsets
     ]
-    is_far = (np.abs(by_image - median_of_all) > tolerance * xy.max()).any()
-    return np.array(by_image) if is_far else no_offset + median_of_all
+    differs = (np.abs(image_offsets - common_offset) > tolerance * xy.max()).any()
+    return np.array(image_offsets) if differs else zero_offsets + common_offset
 
 
 def _points(model: _Model, images: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -33,8 +33,8 @@ from jaxbundle.io.cameras.opencv_file import (
 )
 from jaxbundle.io.cameras.slam_yaml import is_slam_yaml
 from jaxbundle.io.cameras.spellings import (
-    LEFT,
-    Found,
+    IGNORED,
+    EntriesByMeaning,
     camera_entries,
     cameras_within,
     fold,
@@ -69,7 +69,7 @@ SHARED = (
 )
 UNKNOWN = np.full((3, 3), np.nan), np.full(3, np.nan)
 RECTIFIED = Keys((), {
-    **LEFT.left,
+    **IGNORED.ignored,
     **dict.fromkeys(("r1", "r2", "p1", "p2", "q", "r*", "p*", "rectification*", "projection*"),
                     "the rectification, which follows from R and T"),
 })  # fmt: skip
@@ -87,11 +87,11 @@ def is_opencv_rig(path: Path) -> bool:
     # ORB-SLAM's LEFT.K, RIGHT.K stand beside the camera of the rectified images
     if is_slam_yaml(path):
         return False
-    cameras_found = find_cameras(path)
-    if len(cameras_found) > 1:
+    cameras = find_cameras(path)
+    if len(cameras) > 1:
         return True
-    if cameras_found and cameras_found[0][1]:
-        return _sides(cameras_found[0][1]) is not None  # {K: …, K1: …} is none
+    if cameras and cameras[0][1]:
+        return _sides(cameras[0][1]) is not None  # {K: …, K1: …} is none
     return _is_pair(path)
 
 
@@ -119,7 +119,8 @@ def _sides(document: Mapping[str, Any]) -> tuple[str, str] | None:
             {
                 kind
                 for name, value in document.items()
-                if (kind := _of_side(name, value, side)) == "camera_matrix" and is_matrix(value)
+                if (kind := _meaning_on_side(name, value, side)) == "camera_matrix"
+                and is_matrix(value)
             }
             for side in pair
         ]
@@ -128,17 +129,21 @@ def _sides(document: Mapping[str, Any]) -> tuple[str, str] | None:
     return None
 
 
-def _base(name: str, side: str) -> str | None:
+def _name_without_side(name: str, side: str) -> str | None:
     """The name of an entry without its side."""
-    folded = fold(name)
-    if folded.endswith(side) and folded != side:
-        return folded.removesuffix(side)
-    return folded.removeprefix(side) if folded.startswith(side) and folded != side else None
+    folded_name = fold(name)
+    if folded_name.endswith(side) and folded_name != side:
+        return folded_name.removesuffix(side)
+    return (
+        folded_name.removeprefix(side)
+        if folded_name.startswith(side) and folded_name != side
+        else None
+    )
 
 
-def _of_side(name: str, value: Any, side: str) -> str | None:
+def _meaning_on_side(name: str, value: Any, side: str) -> str | None:
     """What an entry is of the camera of a side."""
-    base = _base(name, side)
+    base = _name_without_side(name, side)
     if base is None or (isinstance(value, int | float) and base in ("k", "p", "s")):
         return None
     return meaning_of(base, value)
@@ -164,26 +169,29 @@ def _read_pair(
     path: Path, document: Mapping[str, Any], pair: tuple[str, str], unknown: UnknownKeys
 ) -> tuple[list[Camera], list[CameraFromRig]]:
     """Two cameras whose entries are told apart by their names."""
-    entries_by_side: list[dict[str, Any]] = [{}, {}]
-    other_entries: dict[str, Any] = {}
+    side_entries: list[dict[str, Any]] = [{}, {}]
+    common_entries: dict[str, Any] = {}
     for name, value in document.items():
-        sides = [_of_side(name, value, side) for side in pair]
+        sides = [_meaning_on_side(name, value, side) for side in pair]
         # `distCoeffsL`: of one side; `R1`, `P1`: of the rectification
         if fold(name) in POSES or meaning_of(name, value) in SHARED or not any(sides):
-            other_entries[name] = value
+            common_entries[name] = value
         else:
-            entries_by_side[sides.index(next(filter(None, sides)))][name] = value
-    of_both = {k: v for k, v in other_entries.items() if meaning_of(k, v) in SHARED}
-    shared = camera_entries(of_both, path, unknown)
-    unused = {k: v for k, v in other_entries.items() if meaning_of(k, v) not in SHARED}
-    pose = _take_pose(path, unused)
-    folded = {fold(name): name for name in unused}
-    unknown.check((folded[name] for name in RECTIFIED.unknown(folded)), Keys(POSES), path)
+            side_entries[sides.index(next(filter(None, sides)))][name] = value
+    shared = camera_entries(
+        {k: v for k, v in common_entries.items() if meaning_of(k, v) in SHARED}, path, unknown
+    )
+    other_entries = {k: v for k, v in common_entries.items() if meaning_of(k, v) not in SHARED}
+    pose = _take_pose(path, other_entries)
+    name_by_folded = {fold(name): name for name in other_entries}
+    unknown.check(
+        (name_by_folded[name] for name in RECTIFIED.unknown(name_by_folded)), Keys(POSES), path
+    )
     cameras = []
-    for k, (side, entries) in enumerate(zip(pair, entries_by_side)):
-        by_meaning: Found = dict(shared)
+    for k, (side, entries) in enumerate(zip(pair, side_entries)):
+        by_meaning: EntriesByMeaning = dict(shared)
         for name, value in entries.items():
-            by_meaning[str(_of_side(name, value, side))] = (name, value)
+            by_meaning[str(_meaning_on_side(name, value, side))] = (name, value)
         id = by_meaning.pop("camera_name", ("", side if len(side) > 1 else ("left", "right")[k]))[1]
         cameras.append(camera_of(path, by_meaning, str(id)))
     return cameras, [CameraFromRig(np.eye(3), np.zeros(3)), pose or CameraFromRig(*UNKNOWN)]
@@ -193,51 +201,49 @@ def _read_nested(
     path: Path, document: Any, unknown: UnknownKeys
 ) -> tuple[list[Camera], list[CameraFromRig]]:
     """Cameras that are objects of their own."""
-    nested_cameras = list(cameras_within(document))
-    if len(nested_cameras) < 2:
+    named_cameras = list(cameras_within(document))
+    if len(named_cameras) < 2:
         raise InputError(
-            f"{path}: {count(len(nested_cameras), 'camera')} in it; expected two or more"
+            f"{path}: {count(len(named_cameras), 'camera')} in it; expected two or more"
         )
     cameras, poses = [], []
-    for k, (name, entries) in enumerate(nested_cameras):
-        where, entries_of_camera = f"{path}, {name}", dict(entries)
-        poses.append(_take_pose(where, entries_of_camera))
-        by_meaning = camera_entries(entries_of_camera, where, unknown)
+    for k, (name, entries) in enumerate(named_cameras):
+        where, lens_entries = f"{path}, {name}", dict(entries)
+        poses.append(_take_pose(where, lens_entries))
+        by_meaning = camera_entries(lens_entries, where, unknown)
         id = str(by_meaning.get("camera_name", ("", name or k))[1])
         cameras.append(camera_of(where, by_meaning, id))
     ids = [camera.id for camera in cameras]
     if len({*ids}) < len(ids):
-        names = unique_labels([name for name, _ in nested_cameras], range(len(nested_cameras)))
+        names = unique_labels([name for name, _ in named_cameras], range(len(named_cameras)))
         cameras = [dataclasses.replace(camera, id=name) for camera, name in zip(cameras, names)]
     if isinstance(document, Mapping):
-        names = {name for name, _ in nested_cameras}
+        names = {name for name, _ in named_cameras}
         other_entries = {key: value for key, value in document.items() if key not in names}
         shared = (
-            _take_pose(path, other_entries) if len(nested_cameras) == 2 and not any(poses) else None
+            _take_pose(path, other_entries) if len(named_cameras) == 2 and not any(poses) else None
         )
         if shared is not None:
             poses = [CameraFromRig(np.eye(3), np.zeros(3)), shared]
-        outer_names = {
+        other_keys = {
             fold(key): key
             for key, value in other_entries.items()
-            if not _holds(value, nested_cameras)
+            if not _contains_camera(value, named_cameras)
         }
-        unknown.check(
-            (outer_names[key] for key in RECTIFIED.unknown(outer_names)), Keys(POSES), path
-        )
+        unknown.check((other_keys[key] for key in RECTIFIED.unknown(other_keys)), Keys(POSES), path)
     # With the first as reference, which many files leave out.
     if any(poses[1:]) and poses[0] is None:
         poses[0] = CameraFromRig(np.eye(3), np.zeros(3))
     return cameras, [pose or CameraFromRig(*UNKNOWN) for pose in poses]
 
 
-def _holds(value: Any, nested_cameras: Sequence[tuple[str, Any]]) -> bool:
+def _contains_camera(value: Any, named_cameras: Sequence[tuple[str, Any]]) -> bool:
     """Whether a value contains one of the cameras."""
-    if any(value is entries for _, entries in nested_cameras):
+    if any(value is entries for _, entries in named_cameras):
         return True
     parts = value.values() if isinstance(value, Mapping) else value
     return isinstance(value, Mapping | list) and any(
-        _holds(part, nested_cameras) for part in parts if isinstance(part, Mapping | list)
+        _contains_camera(part, named_cameras) for part in parts if isinstance(part, Mapping | list)
     )
 
 
@@ -250,35 +256,34 @@ def _take_pose(where: object, entries: dict[str, Any]) -> CameraFromRig | None:
         for name, value in entries.items()
         if fold(name) in POSES and value not in (None, [])
     }
-    taken_entries = {kind: (name, entries.pop(name)) for kind, name in name_of_kind.items()}
+    pose_entries = {kind: (name, entries.pop(name)) for kind, name in name_of_kind.items()}
     path = str(where)
     if (
-        "pose" in taken_entries
-        and isinstance(taken_entries["pose"][1], Mapping)
-        and "data" not in taken_entries["pose"][1]
+        "pose" in pose_entries
+        and isinstance(pose_entries["pose"][1], Mapping)
+        and "data" not in pose_entries["pose"][1]
     ):
-        return _take_pose(f"{where}, {taken_entries['pose'][0]}", dict(taken_entries["pose"][1]))
-    if "pose" not in taken_entries and "T" in taken_entries and "R" not in taken_entries:
-        taken_entries["pose"] = taken_entries.pop("T")  # T, 4 × 4
-    if "pose" in taken_entries:
-        name, value = taken_entries["pose"]
+        return _take_pose(f"{where}, {pose_entries['pose'][0]}", dict(pose_entries["pose"][1]))
+    if "pose" not in pose_entries and "T" in pose_entries and "R" not in pose_entries:
+        pose_entries["pose"] = pose_entries.pop("T")  # T, 4 × 4
+    if "pose" in pose_entries:
+        name, value = pose_entries["pose"]
         T = matrix_of(path, name, value, None)
         if T.size not in (12, 16) or (T.size == 16 and (T[12:] != (0, 0, 0, 1)).any()):
             raise InputError(f"{where}: {name} is no pose; expected 4 × 4 numbers, or R and T")
         T = T[:12].reshape(3, 4)
         R, t = T[:, :3], T[:, 3]
-    elif {"R", "T"} <= taken_entries.keys():
-        name, value = taken_entries["R"]
-        R, t = matrix_of(path, name, value, None), matrix_of(path, *taken_entries["T"], None)
+    elif {"R", "T"} <= pose_entries.keys():
+        name, value = pose_entries["R"]
+        R, t = matrix_of(path, name, value, None), matrix_of(path, *pose_entries["T"], None)
         if R.size not in (3, 9) or t.size != 3:
             raise InputError(
-                f"{where}: {name} and {taken_entries['T'][0]} have {R.size} and {t.size} numbers; "
-                "expected "
-                "9, or 3 of a rotation vector, and 3"
+                f"{where}: {name} and {pose_entries['T'][0]} have {R.size} and {t.size} numbers; "
+                "expected 9, or 3 of a rotation vector, and 3"
             )
         R = R.reshape(3, 3) if R.size == 9 else matrices_of_rotation_vectors(R[None])[0]
-    elif taken_entries:
-        ((_, (name, _)),) = taken_entries.items()
+    elif pose_entries:
+        ((_, (name, _)),) = pose_entries.items()
         raise InputError(f"{where}: {name} without the other of R and T; expected both, or none")
     else:
         return None

@@ -122,46 +122,59 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     cameras, spherical = _cameras(scene)
     mirror = MIRROR if spherical and not cameras else np.ones(3)
     if spherical and not cameras:
-        cameras, spherical = {key: _sphere(key, data) for key, data in spherical.items()}, {}
-    views, left_out = _views(scene, cameras, spherical)
+        cameras, spherical = (
+            {key: _spherical_camera(key, data) for key, data in spherical.items()},
+            {},
+        )
+    views, skipped_views = _views(scene, cameras, spherical)
     poses = {key: pose for key, pose in _entries(scene, "extrinsics").items()}
-    tie, rays = _structure(scene, "structure", views)
-    control, clicks = _structure(scene, "control_points", views)
+    tie_points, rays = _structure(scene, "structure", views)
+    control_points, control_rays = _structure(scene, "control_points", views)
     # Numbers of control points and of structure are counted apart, and may be equal.
-    names = {key: f"control {key}" if key in tie else str(key) for key in control}
-    seen_views = {view for view, *_ in (*rays, *clicks)}
-    posed = {key for key, view in views.items() if view.get("id_pose") in poses}
-    without_pose = [
-        _name(views[key]) for key in views if key not in posed and key not in seen_views
+    names = {key: f"control {key}" if key in tie_points else str(key) for key in control_points}
+    measured_views = {view for view, *_ in (*rays, *control_rays)}
+    posed_views = {key for key, view in views.items() if view.get("id_pose") in poses}
+    empty_views = [
+        _view_name(views[key])
+        for key in views
+        if key not in posed_views and key not in measured_views
     ]
-    views = {key: view for key, view in views.items() if key in posed or key in seen_views}
+    views = {
+        key: view for key, view in views.items() if key in posed_views or key in measured_views
+    }
     if not views:
         raise InputError(f"{path}: no view has a pose or an image point")
-    labels = unique_labels([_name(view) for view in views.values()], list(views))
+    labels = unique_labels([_view_name(view) for view in views.values()], list(views))
     image_ids = dict(zip(views, labels))
     network = assemble(
         path,
         foreign_document(path.stem, cameras.values()),
         overrides,
         _images(path, views, image_ids, poses, mirror),
-        _points(path, tie, [names[key] for key in control], mirror),
+        _points(path, tie_points, [names[key] for key in control_points], mirror),
         Columns(
             {
-                "image": [image_ids[view] for view, *_ in (*rays, *clicks)],
-                "point": [*(str(key) for _, key, _ in rays), *(names[key] for _, key, _ in clicks)],
-                **dict(zip("xy", _image_points(path, (*rays, *clicks)).T)),
+                "image": [image_ids[view] for view, *_ in (*rays, *control_rays)],
+                "point": [
+                    *(str(key) for _, key, _ in rays),
+                    *(names[key] for _, key, _ in control_rays),
+                ],
+                **dict(zip("xy", _image_points(path, (*rays, *control_rays)).T)),
             },
             Source(str(path), None, "observation"),
         ),
-        (*_describe_unread(views, left_out, without_pose, mirror is MIRROR), *unknown.messages()),
+        (
+            *_describe_unread(views, skipped_views, empty_views, mirror is MIRROR),
+            *unknown.messages(),
+        ),
     )
-    if not control or not len(network.points):
+    if not control_points or not len(network.points):
         return network
-    place = lambda k: (f"{path}, control_points[{k}]", "X")
-    X = stack_rows(list(control.values()), 3, place) * mirror
-    unknown = np.full((len(control), 3), np.nan)
+    location_of = lambda k: (f"{path}, control_points[{k}]", "X")
+    X = stack_rows(list(control_points.values()), 3, location_of) * mirror
+    no_sigma = np.full((len(control_points), 3), np.nan)
     source = Source(str(path), None, "control point")
-    table = Points(tuple(names.values()), ("control",) * len(control), X, unknown, source)
+    table = Points(tuple(names.values()), ("control",) * len(control_points), X, no_sigma, source)
     return with_control(network, table, datum=not choose_datum(overrides))
 
 
@@ -172,7 +185,7 @@ def _check_keys(scene: JsonFields, unknown: UnknownKeys) -> None:
     unknown.check(scene.document, SCENE_KEYS, scene.path)
     for name, keys in (("views", VIEW_KEYS), ("intrinsics", INTRINSIC_KEYS)):
         for value in _entries(scene, name).values():
-            data = _data(value)
+            data = _pointer_fields(value)
             unknown.check(data.document, keys, data.path)
     for pose in _entries(scene, "extrinsics").values():
         unknown.check(pose.document, POSE_KEYS, pose.path)
@@ -193,16 +206,16 @@ def _plain_values(rows: Any) -> Iterator[dict[str, Any]]:
 
 def _describe_unread(
     views: Mapping[int, JsonFields],
-    left_out: Sequence[str],
-    without_pose: Sequence[str],
+    skipped_views: Sequence[str],
+    empty_views: Sequence[str],
     mirrored: bool,
 ) -> list[str]:
     """Messages about what is not read, and about a mirrored scene."""
     messages = [
-        f"left out {count(len(ids), 'view')} {why}: {list_some(ids)}"
-        for ids, why in (
-            (left_out, "of spherical cameras or without intrinsics"),
-            (without_pose, "without pose and image points"),
+        f"left out {count(len(ids), 'view')} {reason}: {list_some(ids)}"
+        for ids, reason in (
+            (skipped_views, "of spherical cameras or without intrinsics"),
+            (empty_views, "without pose and image points"),
         )
         if ids
     ]
@@ -224,7 +237,7 @@ def _entries(scene: JsonFields, name: str) -> dict[int, JsonFields]:
     return values
 
 
-def _data(value: JsonFields) -> JsonFields:
+def _pointer_fields(value: JsonFields) -> JsonFields:
     """The object of a pointer, with inherited fields."""
     data = value.child("ptr_wrapper.data")
     fields, inherited = {}, data.document
@@ -244,7 +257,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict[str, Any]], dict[int, Js
             names[number % NEW_NUMBER] = value.text("polymorphic_name")
         name = names.get(number % NEW_NUMBER, "")
         if name == SPHERICAL:
-            spherical[key] = _data(value)
+            spherical[key] = _pointer_fields(value)
             continue
         if name not in KINDS:
             raise InputError(
@@ -252,14 +265,14 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict[str, Any]], dict[int, Js
                 f"{', '.join((*KINDS, SPHERICAL))}"
             )
         model, field, coefficients = KINDS[name]
-        data = _data(value)
+        data = _pointer_fields(value)
         f, (cx, cy) = data.number("focal_length"), data.array("principal_point", (2,))
         values = data.array(field, (len(coefficients),)).tolist() if field else ()
         cameras[key] = {
             "id": str(key),
             "model": model,
             "tie": [["fx", "fy"]],
-            "image_size": [data.integer("width", least=1), data.integer("height", least=1)],
+            "image_size": [data.integer("width", minimum=1), data.integer("height", minimum=1)],
             "fx": f,
             "fy": f,
             "cx": float(cx),
@@ -269,9 +282,9 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict[str, Any]], dict[int, Js
     return cameras, spherical
 
 
-def _sphere(key: int, data: JsonFields) -> dict[str, Any]:
+def _spherical_camera(key: int, data: JsonFields) -> dict[str, Any]:
     """The entry of a spherical camera."""
-    w, h = data.integer("width", least=1), data.integer("height", least=1)
+    w, h = data.integer("width", minimum=1), data.integer("height", minimum=1)
     f = max(w, h) / (2 * np.pi)
     return {
         "id": str(key),
@@ -288,22 +301,22 @@ def _views(
     scene: JsonFields, cameras: Mapping[int, dict], spherical: Mapping[int, JsonFields]
 ) -> tuple[dict[int, JsonFields], list[str]]:
     """The views with a camera, by number, and the names of the others."""
-    views, left_out = {}, []
+    views, skipped_views = {}, []
     for key, value in _entries(scene, "views").items():
-        view = _data(value)
+        view = _pointer_fields(value)
         camera = view.integer("id_intrinsic", UNDEFINED_INDEX)
         if camera in cameras:
             views[key] = view
         elif camera in spherical or camera == UNDEFINED_INDEX:
-            left_out.append(_name(view))
+            skipped_views.append(_view_name(view))
         else:
             raise InputError(f"{view.path}: id_intrinsic {camera} is not among the intrinsics")
     if not views:
         raise InputError(f"{scene.path}: no view has a camera that can be read")
-    return views, left_out
+    return views, skipped_views
 
 
-def _name(view: JsonFields) -> str:
+def _view_name(view: JsonFields) -> str:
     return "/".join(filter(None, (view.get("local_path"), view.text("filename"))))
 
 
@@ -341,19 +354,22 @@ def _structure(
 
 
 def _image_points(path: Path, rays: Sequence[tuple[int, int, Any]]) -> Float[np.ndarray, "rays 2"]:
-    def place(k: int) -> tuple[str, str]:
+    def location_of(k: int) -> tuple[str, str]:
         return f"{path}, point {rays[k][1]}, view {rays[k][0]}", "x"
 
-    return stack_rows([x for *_, x in rays], 2, place).reshape(-1, 2)
+    return stack_rows([x for *_, x in rays], 2, location_of).reshape(-1, 2)
 
 
 def _points(
-    path: Path, tie: Mapping[int, Any], control: Sequence[str], mirror: Float[np.ndarray, "3"]
+    path: Path,
+    tie_points: Mapping[int, Any],
+    control: Sequence[str],
+    mirror: Float[np.ndarray, "3"],
 ) -> Columns:
-    place = lambda k: (f"{path}, structure[{k}]", "X")
-    known_coordinates = stack_rows(list(tie.values()), 3, place).reshape(-1, 3) * mirror
-    position = np.concatenate([known_coordinates, np.full((len(control), 3), np.nan)])
-    columns = {"id": [*map(str, tie), *control], "role": ["tie"] * len(position)}
+    location_of = lambda k: (f"{path}, structure[{k}]", "X")
+    tie_positions = stack_rows(list(tie_points.values()), 3, location_of).reshape(-1, 3) * mirror
+    position = np.concatenate([tie_positions, np.full((len(control), 3), np.nan)])
+    columns = {"id": [*map(str, tie_points), *control], "role": ["tie"] * len(position)}
     return Columns(columns | dict(zip("XYZ", position.T)), Source(str(path), None, "point"))
 
 
@@ -370,22 +386,22 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
         _entry(i, {"rotation": R[i].tolist(), "center": images.position[i].tolist()})
         for i in range(len(images))
     ]
-    observations_of_point: list[list[dict]] = [[] for _ in points.id]
+    point_observations: list[list[dict]] = [[] for _ in points.id]
     features = np.zeros(len(images), int)
     for i, p, xy in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
-        observations_of_point[p].append(_entry(i, {"id_feat": int(features[i]), "x": xy}))
+        point_observations[p].append(_entry(i, {"id_feat": int(features[i]), "x": xy}))
         features[i] += 1
-    is_held = points.has_role("control", "fixed")
+    is_control = points.has_role("control", "fixed")
     numbers = written_numbers(points.id)
     tables = [
         [
             _entry(
                 numbers[p],
-                {"X": points.position[p].tolist(), "observations": observations_of_point[p]},
+                {"X": points.position[p].tolist(), "observations": point_observations[p]},
             )
             for p in np.flatnonzero(mask).tolist()
         ]
-        for mask in (~is_held, is_held)
+        for mask in (~is_control, is_control)
     ]
     scene = {
         "sfm_data_version": "0.3",
@@ -428,9 +444,9 @@ def _entry(key: int, value: dict[str, Any]) -> dict[str, Any]:
     return {"key": key, "value": value}
 
 
-def _intrinsics(cameras: Sequence[Camera], first_number: int) -> list[dict[str, Any]]:
-    """The entries of cameras, whose pointers are numbered from `first_number`; only the first of a
-    kind has its name."""
+def _intrinsics(cameras: Sequence[Camera], begin: int) -> list[dict[str, Any]]:
+    """The entries of cameras, whose pointers are numbered from `begin`; only the first of a kind
+    has its name."""
     entries, numbers = [], {}
     for k, camera in enumerate(cameras):
         name, data = _intrinsic(camera)
@@ -438,7 +454,7 @@ def _intrinsics(cameras: Sequence[Camera], first_number: int) -> list[dict[str, 
         if name not in numbers:
             numbers[name] = len(numbers) + 1
             kind = {"polymorphic_id": NEW_NUMBER + numbers[name], "polymorphic_name": name}
-        entries.append(_entry(k, kind | {"ptr_wrapper": {"id": first_number + k, "data": data}}))
+        entries.append(_entry(k, kind | {"ptr_wrapper": {"id": begin + k, "data": data}}))
     return entries
 
 

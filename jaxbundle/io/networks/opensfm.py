@@ -193,30 +193,30 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """
     path = Path(path)
     file = path / RECONSTRUCTION if path.is_dir() else path
-    scene, messages = _largest(file)
+    scene, messages = _largest_reconstruction(file)
     unknown = UnknownKeys()
     unknown.check(scene.document, SCENE_KEYS, file)
     for fields in scene.objects("cameras").values():
         unknown.check(fields.document, CAMERA_KEYS, fields.path)
-    cameras, refusals = _cameras(scene)
-    shots, lost_shots = {}, []
+    cameras, errors = _cameras(scene)
+    shots, omitted_shots = {}, []
     for id, shot in scene.objects("shots").items():
         unknown.check(shot.document, SHOT_KEYS, shot.path)
         camera = shot.text("camera")
         if camera in cameras:
             shots[id] = shot
-        elif camera in refusals:
-            lost_shots.append(id)
+        elif camera in errors:
+            omitted_shots.append(id)
         else:
             raise InputError(f"{shot.path}: camera {camera!r} is not among the cameras")
     if not shots:
-        raise next(iter(refusals.values()), InputError(f"{file}: there are no shots"))
-    if lost_shots:
-        why = "; ".join(str(error).removeprefix(f"{file}, ") for error in refusals.values())
+        raise next(iter(errors.values()), InputError(f"{file}: there are no shots"))
+    if omitted_shots:
+        reason = "; ".join(str(error).removeprefix(f"{file}, ") for error in errors.values())
         messages.append(
-            f"{why}; left out {count(len(lost_shots), 'shot')}: {list_some(lost_shots)}"
+            f"{reason}; left out {count(len(omitted_shots), 'shot')}: {list_some(omitted_shots)}"
         )
-    gps = _positions(shots)
+    gps = _observed_centres(shots)
     points = scene.objects("points")
     for point in points.values():
         unknown.check(point.document, POINT_KEYS, point.path)
@@ -228,25 +228,23 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ).reshape(-1, 3)
         for name, default in (("coordinates", None), ("color", GREY))
     )
-    rays, number_missing = _tracks(file.parent / TRACKS, cameras, shots, points)
-    if number_missing:
+    rays, unmatched_count = _tracks(file.parent / TRACKS, cameras, shots, points)
+    if unmatched_count:
         messages.append(
-            f"left out {count(number_missing, 'image point')} of tracks that have no point"
+            f"left out {count(unmatched_count, 'image point')} of tracks that have no point"
         )
     if points and rays is None:
         messages.append(f"{file.parent / TRACKS} is not there: no image points")
     names, control = list(points), None
     if (file.parent / CONTROL).is_file():
-        camera_of_shot = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
-        control = read_ground_control(
-            file.parent / CONTROL, file.parent / REFERENCE, camera_of_shot
-        )
+        shot_cameras = {id: cameras[shot.text("camera")] for id, shot in shots.items()}
+        control = read_ground_control(file.parent / CONTROL, file.parent / REFERENCE, shot_cameras)
         messages += control.messages
         control = control.renamed({*names})
         names, coordinates, rays = _add_control(file, control, names, coordinates, rays)
         colours = np.concatenate([colours, np.full((len(coordinates) - len(colours), 3), np.nan)])
     if (file.parent / REFERENCE).is_file():
-        messages.append(_reference(file.parent / REFERENCE))
+        messages.append(_describe_reference(file.parent / REFERENCE))
     datum = {"datum": "control"} if gps else {}
     network = assemble(
         file,
@@ -276,21 +274,21 @@ def _add_control(
     rays: Columns | None,
 ) -> tuple[list[str], Float[np.ndarray, "m 3"], Columns]:
     """Points and image points with those of ground control."""
-    added_names = [*(control.points.id if control.points else ()), *control.unknown]
+    control_ids = [*(control.points.id if control.points else ()), *control.unknown]
     columns: dict[str, list] = {}
     for k, name in enumerate(("image", "point", "x", "y")):
         tracked = () if rays is None else rays.values[name]
         columns[name] = [*tracked, *(row[k] for row in control.rays)]
-    unknown = np.full((len(added_names), 3), np.nan)
+    unknown = np.full((len(control_ids), 3), np.nan)
     source = Source(str(file.parent / CONTROL), None, "observation")
     if rays is not None and rays.source.numbers is not None:
         # Lines of the tracks; the image points of control have none.
         lines = np.r_[rays.source.numbers, np.zeros(len(control.rays), np.int64)]
         source = dataclasses.replace(rays.source, numbers=lines)
-    return [*names, *added_names], np.concatenate([coordinates, unknown]), Columns(columns, source)
+    return [*names, *control_ids], np.concatenate([coordinates, unknown]), Columns(columns, source)
 
 
-def _largest(file: Path) -> tuple[JsonFields, list[str]]:
+def _largest_reconstruction(file: Path) -> tuple[JsonFields, list[str]]:
     """The reconstruction with the most shots, and messages about the others."""
     scenes = JsonFields(file, {"": parse_json(file, read_text(file))}).rows("")
     if not scenes:
@@ -309,26 +307,26 @@ def _largest(file: Path) -> tuple[JsonFields, list[str]]:
 
 
 def _cameras(scene: JsonFields) -> tuple[dict[str, Camera], dict[str, NoPlaceError]]:
-    cameras, refusals = {}, {}
+    cameras, errors = {}, {}
     for id, fields in scene.objects("cameras").items():
         try:
             cameras[id] = _camera(id, fields)
         except NoPlaceError as error:
-            refusals[id] = error
-    return cameras, refusals
+            errors[id] = error
+    return cameras, errors
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
     """Our camera; **Raises:** `NoPlaceError` if no model fits."""
     kind = fields.text("projection_type", "perspective")
-    size = fields.integer("width", least=1), fields.integer("height", least=1)
+    size = fields.integer("width", minimum=1), fields.integer("height", minimum=1)
     if kind in SPHERICAL:
         f = max(size) / (2 * np.pi)
         middle = {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}
         return Camera(id, "equirectangular", {"fx": f, "fy": f} | middle, image_size=size)
     if kind not in (*KINDS, *FITTED_KINDS):
-        known_types = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
-        raise InputError(f"{fields.path}: projection_type is {kind}; expected one of {known_types}")
+        choices = ", ".join((*KINDS, *FITTED_KINDS, *SPHERICAL))
+        raise InputError(f"{fields.path}: projection_type is {kind}; expected one of {choices}")
     single = kind in ("perspective", "fisheye", "dual")  # one focal length, centred
     f = [
         max(size) * fields.number(name)
@@ -347,7 +345,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if kind == "dual":
         parameters = {"l": fields.number("transition", 0.5)}
         parameters |= {name: fields.number(name, 0.0) for name in ("k1", "k2")}
-        formula = _dual
+        formula = _project_dual
     else:
         parameters = {name: fields.number(name, 0.0) for name in PRISM}
         exact = (
@@ -359,12 +357,14 @@ def _camera(id: str, fields: JsonFields) -> Camera:
             model = "thin-prism-fisheye" if exact else "kannala-brandt-tangential"
             p = {name: parameters[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
             return Camera(id, model, core | p | exact, image_size=size)
-        formula = _prism
+        formula = _project_fisheye624
     foreign = Foreign(formula, core | parameters, core, size, fisheye=True)
     return fit_camera(id, foreign, str(fields.path), f"is of projection_type {kind}")
 
 
-def _prism(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
+def _project_fisheye624(
+    p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar
+) -> Float[Array, "2"]:
     """fisheye624: decentring and thin prism are of the image of the angle, as the radial part."""
     radius = root(X * X + Y * Y)
     # θ/|[X, Y]|, whose limit on the axis is 1/Z
@@ -380,7 +380,7 @@ def _prism(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Ar
     return jnp.stack([p["fx"] * xd + p["cx"], p["fy"] * yd + p["cy"]])
 
 
-def _dual(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
+def _project_dual(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Array, "2"]:
     """Between a perspective image and one of the angle."""
     radius = root(X * X + Y * Y)
     angle = jnp.arctan2(radius, Z)
@@ -394,26 +394,28 @@ def _dual(p: Mapping[str, Scalar], X: Scalar, Y: Scalar, Z: Scalar) -> Float[Arr
 
 def _images(file: Path, shots: Mapping[str, JsonFields]) -> Columns:
     paths = [str(shot.path) for shot in shots.values()]
-    turn, t = (
+    rotation_vectors, t = (
         stack_rows([shot.get(name) for shot in shots.values()], 3, lambda k, n=name: (paths[k], n))
         for name in ("rotation", "translation")
     )
-    M, X0 = exterior_from_cv(matrices_of_rotation_vectors(turn), t)
+    M, X0 = exterior_from_cv(matrices_of_rotation_vectors(rotation_vectors), t)
     cameras = [shot.text("camera") for shot in shots.values()]
     return image_columns(Source(str(file), None, "shot"), list(shots), cameras, M, X0)
 
 
-def _positions(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
+def _observed_centres(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
     """The observed projection centres, if they define a datum."""
-    observed = {id: shot for id, shot in shots.items() if shot.get("gps_position") is not None}
-    if len(observed) < 3:  # do not determine the seven parameters of a datum
+    positioned_shots = {
+        id: shot for id, shot in shots.items() if shot.get("gps_position") is not None
+    }
+    if len(positioned_shots) < 3:  # do not determine the seven parameters of a datum
         return ()
-    X0 = np.array([shot.array("gps_position", (3,)) for shot in observed.values()])
+    X0 = np.array([shot.array("gps_position", (3,)) for shot in positioned_shots.values()])
     default = 15.0  # m, OpenSfM's default of gps_dop
-    sigma = np.array([shot.number("gps_dop", default) for shot in observed.values()])
+    sigma = np.array([shot.number("gps_dop", default) for shot in positioned_shots.values()])
     sigma = np.where(sigma > 0, sigma, default)
     columns = {
-        "image": list(observed),
+        "image": list(positioned_shots),
         **dict(zip("XYZ", X0.T)),
         **{f"s{axis}": sigma for axis in "XYZ"},
     }
@@ -432,7 +434,7 @@ def _tracks(
     if not file.is_file():
         return None, 0
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y")}
-    lines, number_missing = [], 0
+    lines, unmatched_count = [], 0
     for row in TextRows(file, separator="\t"):
         if row.text.startswith(HEAD):
             version = row.text.removeprefix(HEAD).strip()
@@ -446,23 +448,23 @@ def _tracks(
         if image not in shots:
             continue
         if point not in points:
-            number_missing += 1
+            unmatched_count += 1
             continue
-        x, y = row.numbers(("x", "y"), 3, more=True)
+        x, y = row.numbers(("x", "y"), 3, allow_more=True)
         w, h = not_none(cameras[shots[image].text("camera")].image_size)
         values = (image, point, max(w, h) * x + (w - 1) / 2, max(w, h) * y + (h - 1) / 2)
         for column, value in zip(columns.values(), values):
             column.append(value)
         lines.append(row.number)
-    return Columns(columns, Source(str(file), np.array(lines, np.int64), "line")), number_missing
+    return Columns(columns, Source(str(file), np.array(lines, np.int64), "line")), unmatched_count
 
 
-def _reference(file: Path) -> str:
+def _describe_reference(file: Path) -> str:
     fields = JsonFields(file, read_object(file, read_text(file), "a reference"))
-    reference_in_words = ", ".join(
+    origin = ", ".join(
         f"{name} {fields.number(name):.9g}" for name in ("latitude", "longitude", "altitude")
     )
-    return f"coordinates are topocentric about {reference_in_words} ({REFERENCE})"
+    return f"coordinates are topocentric about {origin} ({REFERENCE})"
 
 
 def write_opensfm(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:
@@ -487,17 +489,19 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     images, points = network.images, network.points
     cameras = {camera.id: _camera_fields(camera) for camera in network.cameras}
     R, t = cv_pose(matrices_of(images.angles), images.position)
-    turn = rotation_vectors_of(R)
-    camera_of_image = [network.cameras[c] for c in images.camera.tolist()]
+    rotation_vectors = rotation_vectors_of(R)
+    image_cameras = [network.cameras[c] for c in images.camera.tolist()]
     shots = {
         id: {"camera": camera.id, "rotation": v, "translation": translation}
-        for id, camera, v, translation in zip(images.id, camera_of_image, turn.tolist(), t.tolist())
+        for id, camera, v, translation in zip(
+            images.id, image_cameras, rotation_vectors.tolist(), t.tolist()
+        )
     }
     # gps_position is the projection centre: antennas with a lever arm are not
-    measured = [
+    antenna_tables = [
         kind for kind in network.further if isinstance(kind, Antennas) and not kind.settings
     ]
-    for antennas in measured:
+    for antennas in antenna_tables:
         for id, X0, C in zip(antennas.image, antennas.position.tolist(), antennas.covariance):
             shots[id] |= {"gps_position": X0, "gps_dop": float(np.sqrt(np.trace(C) / 3))}
     scene = {
@@ -514,7 +518,7 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     write_text(folder / RECONSTRUCTION, json.dumps([scene], indent=1) + "\n")
     write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
     write_text(
-        folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in camera_of_image])
+        folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in image_cameras])
     )
     return describe_losses(network, OPENSFM_LOSSES)
 
@@ -554,11 +558,7 @@ def write_opensfm_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
 
 def _camera_fields(camera: Camera) -> dict[str, Any]:
     """The fields of a camera, of the smallest kind that holds it."""
-    kinds = {
-        name: focal_and_names
-        for name, (model, *focal_and_names) in KINDS.items()
-        if model == camera.model
-    }
+    kinds = {name: rest for name, (model, *rest) in KINDS.items() if model == camera.model}
     all_coefficients = max((names for _, names in kinds.values()), key=len, default=())
     p = check_others_zero(camera, "OpenSfM", all_coefficients)
     w, h = size_of(camera, "OpenSfM")

@@ -52,10 +52,10 @@ class GroundControl(NamedTuple):
     unknown: list[str]
     messages: tuple[str, ...]
 
-    def renamed(self, taken_names: Collection[str]) -> "GroundControl":
+    def renamed(self, track_ids: Collection[str]) -> "GroundControl":
         """With names of their own: tracks and control are numbered apart, and may be equal."""
-        own_names = [*(self.points.id if self.points else ()), *self.unknown]
-        new = {id: f"control {id}" if id in taken_names else id for id in own_names}
+        control_ids = [*(self.points.id if self.points else ()), *self.unknown]
+        new = {id: f"control {id}" if id in track_ids else id for id in control_ids}
         points = self.points and dataclasses.replace(
             self.points, id=tuple(new[id] for id in self.points.id)
         )
@@ -75,21 +75,21 @@ def read_ground_control(
     document = JsonFields(file, read_object(file, read_text(file), "ground control points"))
     unknown.check(document.document, FILE_KEYS, file)
     ids: list[str] = []
-    places, rays, unplaced = [], [], []
+    geodetic, rays, unpositioned_ids = [], [], []
     for point in document.rows("points"):
         unknown.check(point.document, POINT_KEYS, point.path)
         id = point.text("id")
-        if id in ids or id in unplaced:
+        if id in ids or id in unpositioned_ids:
             raise InputError(f"{point.path}: the point {id!r} occurs twice")
         if point.get("position") is None:
-            unplaced.append(id)
+            unpositioned_ids.append(id)
         else:
-            place = point.child("position")
-            unknown.check(place.document, POSITION_KEYS, place.path)
+            position = point.child("position")
+            unknown.check(position.document, POSITION_KEYS, position.path)
             if point.get("has_altitude") is False:
                 raise InputError(f"{point.path}: has_altitude is false; expected an altitude")
             ids.append(id)
-            places.append([place.number(name) for name in POSITION_KEYS.used])
+            geodetic.append([position.number(name) for name in POSITION_KEYS.used])
         for ray in point.rows("observations"):
             unknown.check(ray.document, RAY_KEYS, ray.path)
             image = ray.text("shot_id")
@@ -98,28 +98,31 @@ def read_ground_control(
                 w, h = not_none(cameras[image].image_size)
                 side = max(w, h)
                 rays.append((image, id, side * x + (w - 1) / 2, side * y + (h - 1) / 2))
-    seen_points = {point for _, point, *_ in rays}
+    measured_ids = {point for _, point, *_ in rays}
     messages = list(unknown.messages())
-    keep = [k for k, id in enumerate(ids) if id in seen_points]
+    measured_rows = [k for k, id in enumerate(ids) if id in measured_ids]
     points = None
-    if keep and not reference.is_file():
+    if measured_rows and not reference.is_file():
         messages.append(
-            f"{file.name}: left out {count(len(keep), 'control point')}: latitudes and longitudes "
-            f"need {reference.name}, which is not beside it"
+            f"{file.name}: left out {count(len(measured_rows), 'control point')}: latitudes and "
+            f"longitudes need {reference.name}, which is not beside it"
         )
-        dropped = {ids[k] for k in keep}
-        rays = [ray for ray in rays if ray[1] not in dropped]
-    elif keep:
-        sigma = np.tile([HORIZONTAL_SIGMA, HORIZONTAL_SIGMA, VERTICAL_SIGMA], (len(keep), 1))
-        local = _topocentric(_origin(reference), np.array(places)[keep])
-        names = tuple(ids[k] for k in keep)
-        points = Points(names, ("control",) * len(keep), local, sigma, Source(str(file)))
+        dropped_ids = {ids[k] for k in measured_rows}
+        rays = [ray for ray in rays if ray[1] not in dropped_ids]
+    elif measured_rows:
+        sigma = np.tile(
+            [HORIZONTAL_SIGMA, HORIZONTAL_SIGMA, VERTICAL_SIGMA], (len(measured_rows), 1)
+        )
+        local = _topocentric(_origin(reference), np.array(geodetic)[measured_rows])
+        names = tuple(ids[k] for k in measured_rows)
+        points = Points(names, ("control",) * len(measured_rows), local, sigma, Source(str(file)))
         messages.append(
-            f"{file.name}: {len(keep)} control points, whose σ are not in it; taken as OpenSfM's, "
-            f"{HORIZONTAL_SIGMA:g} m, {VERTICAL_SIGMA:g} m in height (--control FILE gives others)"
+            f"{file.name}: {len(measured_rows)} control points, whose σ are not in it; taken as "
+            f"OpenSfM's, {HORIZONTAL_SIGMA:g} m, {VERTICAL_SIGMA:g} m in height (--control FILE "
+            "gives others)"
         )
     return GroundControl(
-        points, rays, [id for id in unplaced if id in seen_points], tuple(messages)
+        points, rays, [id for id in unpositioned_ids if id in measured_ids], tuple(messages)
     )
 
 
@@ -129,17 +132,19 @@ def _origin(reference: Path) -> Float[np.ndarray, "3"]:
 
 
 def _topocentric(
-    origin: Float[np.ndarray, "3"], places: Float[np.ndarray, "n 3"]
+    origin: Float[np.ndarray, "3"], geodetic_positions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """East, north, up of latitude, longitude [°] and altitude, about an origin in the same form."""
     with local_x64():
-        X = np.array([_geocentric(place) for place in (origin, *places)])
+        X = np.array(
+            [_geocentric(geodetic_position) for geodetic_position in (origin, *geodetic_positions)]
+        )
     latitude, longitude = np.radians(origin[:2])
     (sf, cf), (sl, cl) = ((np.sin(a), np.cos(a)) for a in (latitude, longitude))
     R = np.array([[-sl, cl, 0], [-sf * cl, -sf * sl, cf], [cf * cl, cf * sl, sf]])
     return (X[1:] - X[0]) @ R.T
 
 
-def _geocentric(place: Any) -> Float[np.ndarray, "3"]:
-    latitude, longitude, altitude = place
+def _geocentric(geodetic_position: Any) -> Float[np.ndarray, "3"]:
+    latitude, longitude, altitude = geodetic_position
     return np.array(earth_fixed(WGS84, (np.radians(longitude), np.radians(latitude), altitude)))

@@ -51,8 +51,8 @@ def from_opensfm(reconstruction: Any, tracks: Any = None, overrides: Sequence[st
             network = read_opensfm(folder, overrides)
         except InputError as error:
             raise InputError(str(error).replace(folder, "reconstruction")) from None
-    statements = {
+    messages = {
         kind: tuple(text.replace(folder, "reconstruction") for text in getattr(network, kind))
         for kind in ("warnings", "notes")
     }
-    return network.replace(name="reconstruction", **statements)
+    return network.replace(name="reconstruction", **messages)

@@ -86,13 +86,13 @@ class Resources(NamedTuple):
 
     def document(self, kind: str) -> JsonFields | None:
         """The only file of a format; None if there is none."""
-        files_of_kind = self.files.get(kind, [])
-        if len(files_of_kind) > 1:
+        paths = self.files.get(kind, [])
+        if len(paths) > 1:
             raise InputError(
-                f"{self.path}: {len(files_of_kind)} resources of format {kind}, "
-                f"{list_some(files_of_kind, as_text=str)}; expected a project with one calibration"
+                f"{self.path}: {len(paths)} resources of format {kind}, "
+                f"{list_some(paths, as_text=str)}; expected a project with one calibration"
             )
-        return _read_file(files_of_kind[0], kind, self.unknown) if files_of_kind else None
+        return _read_json(paths[0], kind, self.unknown) if paths else None
 
 
 def is_opf(path: Path) -> bool:
@@ -117,7 +117,7 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         )
     messages: list[str] = []
     cameras = _sensors(calibrated, resources.document(INPUT_CAMERAS), messages)
-    shift = _shift(resources.document(FRAME), messages)
+    shift = _canonical_shift(resources.document(FRAME), messages)
     rows = calibrated.rows("cameras")
     if not rows:
         raise InputError(f"{calibrated.path}: there are no cameras")
@@ -138,15 +138,15 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in angles]),
         X0,
     )
-    marked, marks, control = _control(resources, names, shift, messages)
-    tie, rays = _tracks(resources, names, shift)
+    marked_points, marked_rays, control = _control(resources, names, shift, messages)
+    tie_points, tie_rays = _tracks(resources, names, shift)
     network = assemble(
         path,
         foreign_document(path.stem, cameras.values(), object_unit="m"),
         overrides,
         images,
-        _join_columns(marked, tie, Source(str(path), None, "point")),
-        _join_columns(marks, rays, Source(str(path), None, "image point")),
+        _join_tables(marked_points, tie_points, Source(str(path), None, "point")),
+        _join_tables(marked_rays, tie_rays, Source(str(path), None, "image point")),
         (*messages, *unknown.messages()),
     )
     if control is not None:
@@ -157,28 +157,28 @@ def read_opf(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 # --- files ----------------------------------------------------------------------------------
 
 
-def _read_file(path: Path, kind: str, unknown: UnknownKeys) -> JsonFields:
+def _read_json(path: Path, kind: str, unknown: UnknownKeys) -> JsonFields:
     document = read_object(path, read_text(path), "OPF")
     unknown.check_objects(document, KEYS[kind], path)
     return JsonFields(path, document)
 
 
 def _resources(path: Path, unknown: UnknownKeys) -> Resources:
-    file = _read_file(path, PROJECT, unknown)
+    file = _read_json(path, PROJECT, unknown)
     files: dict[str, list[Path]] = {}
     tracks: list[Path] = []
     for item in file.rows("items"):
         for row in item.rows("resources"):
-            place, kind = _place(path, row.text("uri")), row.text("format")
+            resource_path, kind = _resource_path(path, row.text("uri")), row.text("format")
             files.setdefault(kind, [])
-            if place not in files[kind]:
-                files[kind].append(place)
+            if resource_path not in files[kind]:
+                files[kind].append(resource_path)
             if item.text("type") == "calibration" and kind == TRACKS:
-                tracks.append(place)
+                tracks.append(resource_path)
     return Resources(path, files, tracks[0] if tracks else None, unknown)
 
 
-def _place(path: Path, uri: str) -> Path:
+def _resource_path(path: Path, uri: str) -> Path:
     """The file of a resource, relative to the project."""
     # A project from the network would be read from anywhere.
     parts = urlparse(uri)
@@ -192,8 +192,8 @@ def _id(row: JsonFields, key: str) -> str:
     # Not `integer`, which a float beyond 2⁵³ would not reach: identifiers have 64 bits.
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
-        fault = "missing" if value is None else f"{value!r}; expected a whole number"
-        raise InputError(f"{row.path}: {key} is {fault}")
+        problem = "missing" if value is None else f"{value!r}; expected a whole number"
+        raise InputError(f"{row.path}: {key} is {problem}")
     return str(value)
 
 
@@ -211,19 +211,19 @@ def _files(camera_list: JsonFields | None) -> dict[str, str]:
 
 
 def _sensors(
-    calibrated: JsonFields, input_cameras: JsonFields | None, messages: list[str]
+    calibrated: JsonFields, input_sensors: JsonFields | None, messages: list[str]
 ) -> dict[str, dict[str, Any]]:
     """The entries of the sensors by id."""
-    described = {
+    input_rows = {
         _id(row, "id"): row
-        for row in ([] if input_cameras is None else input_cameras.rows("sensors"))
+        for row in ([] if input_sensors is None else input_sensors.rows("sensors"))
     }
     rows = {_id(row, "id"): row for row in calibrated.rows("sensors")}
-    labels = [str(described[id].get("name") or id) if id in described else id for id in rows]
+    labels = [str(input_rows[id].get("name") or id) if id in input_rows else id for id in rows]
     entries = {}
     for (id, row), label in zip(rows.items(), unique_labels(labels, list(rows))):
         internals = row.child("internals")
-        size = described[id].array("image_size_px", (2,)) if id in described else None
+        size = input_rows[id].array("image_size_px", (2,)) if id in input_rows else None
         entry, fit = _camera(internals, size)
         messages += [f"sensor {label!r}: {fit}"] if fit else []
         sizes = {} if size is None else {"image_size": [int(n) for n in size]}
@@ -279,7 +279,7 @@ def _project_fisheye(p: Mapping[str, Any], X: Scalar, Y: Scalar, Z: Scalar) -> F
 # --- coordinates ----------------------------------------------------------------------------
 
 
-def _shift(frame: JsonFields | None, messages: list[str]) -> Float[np.ndarray, "3"]:
+def _canonical_shift(frame: JsonFields | None, messages: list[str]) -> Float[np.ndarray, "3"]:
     """What positions have on top of the canonical coordinates."""
     if frame is None:
         return np.zeros(3)
@@ -305,39 +305,42 @@ def _control(
     input_points, projected = resources.document(INPUT_POINTS), resources.document(PROJECTED_POINTS)
     # Manual tie points have marks as control points have, but no coordinates.
     rows = [] if input_points is None else [*input_points.rows("gcps"), *input_points.rows("mtps")]
-    ids, checks, marks = [], {}, []
+    ids, is_check, marks = [], {}, []
     for row in rows:
         id = row.text("id")
-        marks_of_point = []
+        point_marks = []
         for mark in row.rows("marks"):
             if (image := images.get(_id(mark, "camera_id"))) is not None:
-                marks_of_point.append(
-                    (image, id, *(mark.array("position_px", (2,)) - PIXEL_CENTRE))
-                )
-        if marks_of_point:
+                point_marks.append((image, id, *(mark.array("position_px", (2,)) - PIXEL_CENTRE)))
+        if point_marks:
             ids.append(id)
-            checks[id] = bool(row.get("is_checkpoint"))
-            marks += marks_of_point
-    blank = [None] * len(ids)
-    points = {"id": ids, "role": ["tie"] * len(ids), "X": blank, "Y": blank, "Z": blank}
+            is_check[id] = bool(row.get("is_checkpoint"))
+            marks += point_marks
+    empty_column = [None] * len(ids)
+    points = {
+        "id": ids,
+        "role": ["tie"] * len(ids),
+        "X": empty_column,
+        "Y": empty_column,
+        "Z": empty_column,
+    }
     image, point, x, y = zip(*marks) if marks else ((), (), (), ())
-    mark_rows = {"image": image, "point": point, "x": x, "y": y}
-    projected_rows = [] if projected is None else projected.rows("projected_gcps")
-    projected_rows = [row for row in projected_rows if row.text("id") in checks]
-    if not projected_rows:
+    rays = {"image": image, "point": point, "x": x, "y": y}
+    control_rows = [] if projected is None else projected.rows("projected_gcps")
+    control_rows = [row for row in control_rows if row.text("id") in is_check]
+    if not control_rows:
         if input_points is not None and input_points.rows("gcps"):
             messages.append(
                 f"{input_points.path}: its control points have no projected coordinates; their "
-                "marks are "
-                "read as those of tie points"
+                "marks are read as those of tie points"
             )
-        return points, mark_rows, None
-    names = [row.text("id") for row in projected_rows]
+        return points, rays, None
+    names = [row.text("id") for row in control_rows]
     control = Points(
         tuple(names),
-        tuple("check" if checks[name] else "control" for name in names),
-        np.array([row.array("coordinates", (3,)) for row in projected_rows]) - shift,
-        np.array([row.array("sigmas", (3,)) for row in projected_rows]),
+        tuple("check" if is_check[name] else "control" for name in names),
+        np.array([row.array("coordinates", (3,)) for row in control_rows]) - shift,
+        np.array([row.array("sigmas", (3,)) for row in control_rows]),
         Source(str(resources.path)),
     )
     # Fewer than three points do not determine the seven parameters of a datum.
@@ -346,8 +349,8 @@ def _control(
             f"{resources.path}: {control.role.count('control')} control points with marks; they "
             "are not used, since three are needed for a datum"
         )
-        return points, mark_rows, None
-    return points, mark_rows, control
+        return points, rays, None
+    return points, rays, control
 
 
 # --- tie points -----------------------------------------------------------------------------
@@ -361,7 +364,7 @@ def _tracks(
     rays: dict[str, Any] = {"image": [], "point": [], "x": [], "y": []}
     if (path := resources.tracks) is None:
         return points, rays
-    file = _read_file(path, TRACKS, resources.unknown)
+    file = _read_json(path, TRACKS, resources.unknown)
     colours = []
     for node in file.rows("nodes"):
         if node.get("children") and node.get("matrix") is not None:
@@ -369,13 +372,13 @@ def _tracks(
         if node.get("mesh") is None:
             continue
         # The specification has one primitive a mesh.
-        primitive = _row_of(_row_of(file, "meshes", node.integer("mesh")), "primitives", 0)
+        primitive = _object_at(_object_at(file, "meshes", node.integer("mesh")), "primitives", 0)
         if primitive.get("extensions") is None or MATCHES not in primitive.get("extensions"):
             continue
         matches = primitive.child("extensions").child(MATCHES)
         X = _positions(file, node, primitive) - shift
-        number_before = len(points["id"])
-        names = [f"t{number_before + k}" for k in range(len(X))]
+        offset = len(points["id"])
+        names = [f"t{offset + k}" for k in range(len(X))]
         points["id"] += names
         points["role"] += ["tie"] * len(X)
         for axis, column in zip("XYZ", X.T.tolist()):
@@ -398,10 +401,10 @@ def _tracks(
         # The rows of the matches of the first point, the second, …: ranges may be in any order.
         point = np.repeat(np.arange(len(X)), number)
         match_rows = np.repeat(begin - np.cumsum(number) + number, number) + np.arange(number.sum())
-        seen_in = [images.get(uid) for uid in uids]
-        is_kept = np.array([seen_in[c] is not None for c in camera[match_rows]], bool)
-        match_rows, point = match_rows[is_kept], point[is_kept]
-        rays["image"] += [seen_in[c] for c in camera[match_rows]]
+        image_names = [images.get(uid) for uid in uids]
+        has_image = np.array([image_names[c] is not None for c in camera[match_rows]], bool)
+        match_rows, point = match_rows[has_image], point[has_image]
+        rays["image"] += [image_names[c] for c in camera[match_rows]]
         rays["point"] += [names[p] for p in point]
         for name, column in zip("xy", (xy[match_rows].astype(float) - PIXEL_CENTRE).T.tolist()):
             rays[name] += column
@@ -414,21 +417,21 @@ def _positions(
     file: JsonFields, node: JsonFields, primitive: JsonFields
 ) -> Float[np.ndarray, "n 3"]:
     """The points of a mesh in the processing system."""
-    own_positions = _accessor(
-        file, primitive.child("attributes").integer("POSITION"), "VEC3"
-    ).astype(float)
+    mesh_points = _accessor(file, primitive.child("attributes").integer("POSITION"), "VEC3").astype(
+        float
+    )
     # By columns, in double precision: it holds the offset of single-precision positions.
     T = node.array("matrix", (16,), np.eye(4).ravel().tolist()).reshape(4, 4).T
-    x, y, z = (own_positions @ T[:3, :3].T + T[:3, 3]).T
+    x, y, z = (mesh_points @ T[:3, :3].T + T[:3, 3]).T
     return np.stack([x, -z, y], 1)
 
 
 def _colours(file: JsonFields, primitive: JsonFields, n: int) -> Float[np.ndarray, "n 3"]:
-    colour_accessor = primitive.get("attributes.COLOR_0")
-    if colour_accessor is None:
+    accessor_index = primitive.get("attributes.COLOR_0")
+    if accessor_index is None:
         return np.full((n, 3), np.nan)
     colours = _accessor(
-        file, JsonFields(file.path, {"COLOR_0": colour_accessor}).integer("COLOR_0"), None
+        file, JsonFields(file.path, {"COLOR_0": accessor_index}).integer("COLOR_0"), None
     )
     return colours[:, :3].astype(float)
 
@@ -440,11 +443,11 @@ def _ranges(file: JsonFields, matches: JsonFields, n: int) -> tuple[np.ndarray, 
         raise InputError(f"{file.path}: {len(pair)} ranges of matches of {n} points")
     # Little-endian: the first of the two numbers of 32 bits is the low one.
     packed = pair[:, 0] | (pair[:, 1] << np.uint64(32))
-    first_match = packed & np.uint64(2**40 - 1)
-    return first_match.astype(np.int64), (packed >> np.uint64(40)).astype(np.int64)
+    begin = packed & np.uint64(2**40 - 1)
+    return begin.astype(np.int64), (packed >> np.uint64(40)).astype(np.int64)
 
 
-def _row_of(file: JsonFields, key: str, index: int) -> JsonFields:
+def _object_at(file: JsonFields, key: str, index: int) -> JsonFields:
     rows = file.rows(key)
     if index >= len(rows):
         raise InputError(f"{file.path}: {key}[{index}] is missing")
@@ -453,15 +456,15 @@ def _row_of(file: JsonFields, key: str, index: int) -> JsonFields:
 
 def _accessor(file: JsonFields, index: int, kind: str | None) -> np.ndarray:
     """The numbers of an accessor, a row an element."""
-    accessor = _row_of(file, "accessors", index)
+    accessor = _object_at(file, "accessors", index)
     component, form = accessor.integer("componentType"), accessor.text("type")
     if component not in COMPONENTS or form not in LENGTHS or kind not in (None, form):
         raise InputError(
             f"{accessor.path}: numbers of type {component}, {form}, where {kind or 'VEC4'} is "
             "expected"
         )
-    view = _row_of(file, "bufferViews", accessor.integer("bufferView"))
-    buffer = _row_of(file, "buffers", view.integer("buffer"))
+    view = _object_at(file, "bufferViews", accessor.integer("bufferView"))
+    buffer = _object_at(file, "buffers", view.integer("buffer"))
     dtype = np.dtype(COMPONENTS[component])
     width = dtype.itemsize * LENGTHS[form]
     if accessor.get("sparse") is not None or view.integer("byteStride", width) != width:
@@ -470,26 +473,26 @@ def _accessor(file: JsonFields, index: int, kind: str | None) -> np.ndarray:
             "of an accessor one after the other"
         )
     number = accessor.integer("count") * LENGTHS[form]
-    place = _place(Path(file.path), buffer.text("uri"))
-    check_plain(place)
+    buffer_path = _resource_path(Path(file.path), buffer.text("uri"))
+    check_plain(buffer_path)
     begin = view.integer("byteOffset", 0) + accessor.integer("byteOffset", 0)
     try:
         # Before anything is allocated for a count in a damaged header.
-        bytes_present = place.stat().st_size
-        if begin + number * dtype.itemsize > bytes_present:
+        byte_count = buffer_path.stat().st_size
+        if begin + number * dtype.itemsize > byte_count:
             raise InputError(
-                f"{place}: {bytes_present} bytes, where {begin + number * dtype.itemsize} are "
+                f"{buffer_path}: {byte_count} bytes, where {begin + number * dtype.itemsize} are "
                 "expected"
             )
-        numbers = np.fromfile(place, dtype, number, offset=begin)
+        numbers = np.fromfile(buffer_path, dtype, number, offset=begin)
     except OSError as error:
-        raise InputError(f"{place}: cannot be read: {error.strerror}") from None
+        raise InputError(f"{buffer_path}: cannot be read: {error.strerror}") from None
     if dtype.kind == "f" and not np.isfinite(numbers).all():
-        raise InputError(f"{place}: a number that is not finite")
+        raise InputError(f"{buffer_path}: a number that is not finite")
     return numbers.reshape(-1, LENGTHS[form])
 
 
-def _join_columns(
+def _join_tables(
     first_table: Mapping[str, Any], second_table: Mapping[str, Any], source: Source
 ) -> Columns:
     """The rows of two tables; a column that one lacks is empty there."""

@@ -91,14 +91,14 @@ def read_orientation_covariance(path: str | Path, radians: float) -> Orientation
     unknowns = tuple(
         (str(a).strip(), str(b).strip(), str(c).strip()) for a, b, c in zip(kinds, ids, names)
     )
-    first_row: dict[Unknown, int] = {}
+    first_rows: dict[Unknown, int] = {}
     for k, unknown in enumerate(unknowns):
-        if unknown in first_row:
+        if unknown in first_rows:
             raise InputError(
                 f"{table.source(k)}: {' '.join(unknown)} is listed twice, also in "
-                f"{table.source(first_row[unknown])}"
+                f"{table.source(first_rows[unknown])}"
             )
-        first_row[unknown] = k
+        first_rows[unknown] = k
     # Correlations are written with all digits: what is below 0 is rounding of them, or edited.
     if n and np.linalg.eigvalsh(R)[0] < -1e-6 * n:
         raise InputError(

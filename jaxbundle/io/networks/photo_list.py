@@ -78,12 +78,16 @@ def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def _columns(
-    path: Path, rows: Sequence["_Row"], names: Sequence[str], id: str = "id", **more: Sequence[str]
+    path: Path,
+    rows: Sequence["_Row"],
+    names: Sequence[str],
+    id: str = "id",
+    **extra_columns: Sequence[str],
 ) -> Columns:
     """The table of some lines: their ids in the column `id`, their first values by `names`."""
     source = Source(str(path), np.array([row.line for row in rows]), "line")
     values = {name: [row.values[k] for row in rows] for k, name in enumerate(names)}
-    return Columns({id: [row.id for row in rows], **more, **values}, source)
+    return Columns({id: [row.id for row in rows], **extra_columns, **values}, source)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +133,7 @@ class _Parser:
     def parse(self) -> tuple[float, list[_Row], list[_Row], list[_Row]]:
         focal = self._focal_length()
         photos, image_points, object_points = [], [], []
-        counted = "line 1 gives the focal length"
+        count_source = "line 1 gives the focal length"
         # 7 words are an object point, 13 or more a photograph, whose name may have blanks
         while self._has_more() and len(self.lines[self.next][1]) != 7:
             number, words = self.lines[self.next]
@@ -137,13 +141,13 @@ class _Parser:
                 raise self._error(
                     number,
                     f"{count(len(words), 'value')} where a photograph (name, 6 values, "
-                    f"6 σ) or an object point (id, 3 values, 3 σ) is expected; {counted}",
+                    f"6 σ) or an object point (id, 3 values, 3 σ) is expected; {count_source}",
                 )
             photo = self._row(" ".join(words[:-12]), words[-12:], PHOTO)
             count_line, size = self._count(photo)
-            counted = f"line {count_line} announces {size} image points of {photo}"
+            count_source = f"line {count_line} announces {size} image points of {photo}"
             for k in range(size):
-                image_points.append(self._image_point(photo, counted, k))
+                image_points.append(self._image_point(photo, count_source, k))
             photos.append(photo)
         if not photos:
             raise self._error(self.lines[-1][0], "no photograph after the focal length")
@@ -184,18 +188,18 @@ class _Parser:
         self.next += 1
         return number, int(words[0])
 
-    def _image_point(self, photo: _Row, counted: str, number_done: int) -> _Row:
+    def _image_point(self, photo: _Row, count_source: str, read_count: int) -> _Row:
         if not self._has_more():
             raise self._error(
                 self.lines[-1][0],
-                f"the file ends after {count(number_done, 'image point')}; {counted}",
+                f"the file ends after {count(read_count, 'image point')}; {count_source}",
             )
         number, words = self.lines[self.next]
         if len(words) != 5:
             raise self._error(
                 number,
                 f"{count(len(words), 'value')} where an image point (id, x, y, σx, σy) is "
-                f"expected; {counted}, this is number {number_done + 1}",
+                f"expected; {count_source}, this is number {read_count + 1}",
             )
         return self._row(words[0], words[1:], IMAGE_POINT, photo.id)
 
@@ -210,14 +214,14 @@ class _Parser:
         ]
         return dataclasses.replace(row, values=tuple(values))
 
-    def _number(self, line: int, noun: str, word: str, finite: bool = True) -> float:
+    def _number(self, line: int, name: str, word: str, finite: bool = True) -> float:
         try:
             number = float(word)
         except ValueError:
             number = None
         # float() reads 1_0 as ten
         if number is None or "_" in word or (finite and not math.isfinite(number)):
-            raise self._error(line, f"{noun} is {word!r}; expected a number")
+            raise self._error(line, f"{name} is {word!r}; expected a number")
         return number
 
     def _has_more(self) -> bool:

@@ -93,50 +93,50 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
     path = Path(path)
     rows = TextRows(path, blank=True, fallback="latin-1")
     # Exports differ in the empty lines before the title.
-    while rows.more() and not rows.next_words():
+    while rows.has_more() and not rows.next_words():
         rows.take("the title")
     rows.take("the title")
     head = [
-        _take(rows, noun)
-        for noun in ("tolerance and iterations", "default σ", "the default camera", "its σ")
+        _take_numbers(rows, expected)
+        for expected in ("tolerance and iterations", "default σ", "the default camera", "its σ")
     ]
     numbers = head[0].all_numbers("tolerance, iterations, width, height")
     size = numbers[2:4].tolist() if len(numbers) >= 4 else None
     photos = _photos(rows, header_camera(head[2]))
     if not photos:
         raise head[3].error("no photograph follows")
-    document, cameras, of_camera, half_units = _document(path, photos, size, overrides)
+    document, cameras, camera_overrides, half_units = _document(path, photos, size, overrides)
     control, objects = _points(rows, "control points"), _points(rows, "object points")
-    names = dict(zip((photo.number for photo in photos), _names([photo.name for photo in photos])))
+    names = dict(
+        zip((photo.number for photo in photos), _file_names([photo.name for photo in photos]))
+    )
     marks = _marks(rows, names)
     renumbered = renumber_smart(path, objects, marks)
     points = point_table(path, control, objects, marks.id)
     if len(control):
         document["project"]["datum"] = "control"
-    outer = np.array([photo.outer for photo in photos])
+    exterior = np.array([photo.outer for photo in photos])
     # One photograph may be the origin; several at the same place are not oriented.
-    nowhere = (outer == 0).all(1)
-    if nowhere.sum() > 1:
-        outer[nowhere] = np.nan
+    is_at_origin = (exterior == 0).all(1)
+    if is_at_origin.sum() > 1:
+        exterior[is_at_origin] = np.nan
     images = image_columns(
         Source(str(path), np.array([photo.line for photo in photos]), "line"),
         list(names.values()),
         cameras,
-        matrices_of(np.radians(outer[:, :2:-1])),  # κ, φ, ω in the file
-        outer[:, :3],
+        matrices_of(np.radians(exterior[:, :2:-1])),  # κ, φ, ω in the file
+        exterior[:, :3],
     )
-    other_overrides = [override for override in overrides if override not in of_camera]
+    remaining_overrides = [override for override in overrides if override not in camera_overrides]
     network = assemble(
-        path, document, other_overrides, images, points, ray_table(path, marks, names)
+        path, document, remaining_overrides, images, points, ray_table(path, marks, names)
     )
     warnings = [renumbered] if renumbered else []
-    without_coordinates = [
-        id for id, X in zip(points.values["id"], points.values["X"]) if np.isnan(X)
-    ]
-    if without_coordinates:
-        count_of_lost = count(len(without_coordinates), "point")
+    unlocated_ids = [id for id, X in zip(points.values["id"], points.values["X"]) if np.isnan(X)]
+    if unlocated_ids:
+        unlocated_count = count(len(unlocated_ids), "point")
         warnings.append(
-            f"{count_of_lost} without coordinates in the file: {list_some(without_coordinates)}"
+            f"{unlocated_count} without coordinates in the file: {list_some(unlocated_ids)}"
         )
     return network.warn(*warnings, *rounding_warnings(network.cameras, half_units))
 
@@ -146,7 +146,7 @@ def _document(
 ) -> tuple[Document, list[str], list[str], Float[np.ndarray, "cameras 10"]]:
     """Settings and cameras with overrides; the camera of each photograph; the
     overrides used; and half a unit of the last decimal of the values of each camera."""
-    distinct, first_photo, camera = np.unique(
+    distinct, first_photos, camera = np.unique(
         np.array([photo.inner for photo in photos]), axis=0, return_index=True, return_inverse=True
     )
     names = ["cam"] if len(distinct) == 1 else [f"cam{k + 1}" for k in range(len(distinct))]
@@ -157,12 +157,12 @@ def _document(
         residuals="corrected",
     )
     # The pixel size follows from an image size that may come from the command line.
-    of_camera = [override for override in overrides if override.startswith("camera.")]
-    document = apply_overrides(document, of_camera)
+    camera_overrides = [override for override in overrides if override.startswith("camera.")]
+    document = apply_overrides(document, camera_overrides)
     for entry, values in zip(document["camera"], distinct):
         _add_pixel_size(path, entry, values)
-    half_units = np.array([photos[k].half_unit for k in first_photo])
-    return document, [names[c] for c in camera.reshape(-1)], of_camera, half_units
+    half_units = np.array([photos[k].half_unit for k in first_photos])
+    return document, [names[c] for c in camera.reshape(-1)], camera_overrides, half_units
 
 
 def _add_pixel_size(path: Path, entry: dict[str, Any], values: Inner) -> None:
@@ -207,23 +207,23 @@ def _photos(rows: TextRows, header: tuple[Inner, Inner] | None) -> list[Photo]:
         inner = photo_camera(_read_numbered(rows, number, "the camera"), header)
         _read_numbered(rows, number, "σ of the camera").numbers(INNER, 1)
         photos.append(Photo(number, name or f"photo {number}", row.number, outer, *inner))
-    if rows.more():
+    if rows.has_more():
         rows.take("an empty line")
     return photos
 
 
-def _read_numbered(rows: TextRows, number: int, noun: str) -> TextRow:
-    row = _take(rows, f"{noun} of photograph {number}")
+def _read_numbered(rows: TextRows, number: int, name: str) -> TextRow:
+    row = _take_numbers(rows, f"{name} of photograph {number}")
     # A line that was lost would shift all values after it.
-    if row.integer(0, f"the number of the photograph before {noun}") != number:
-        raise row.error(f"expected {noun} of photograph {number}, not of {row.words[0]}")
+    if row.integer(0, f"the number of the photograph before {name}") != number:
+        raise row.error(f"expected {name} of photograph {number}, not of {row.words[0]}")
     return row
 
 
-def _points(rows: TextRows, noun: str) -> PhotoModelerBlock:
+def _points(rows: TextRows, kind: str) -> PhotoModelerBlock:
     ids, values, lines = [], [], []
-    for row in _block(rows):
-        ids.append(str(row.integer(0, f"the number of one of the {noun}")))
+    for row in _block_rows(rows):
+        ids.append(str(row.integer(0, f"the number of one of the {kind}")))
         values.append(row.numbers(POINT, 1))
         lines.append(row.number)
     return PhotoModelerBlock(ids, np.array(values).reshape(-1, 6), lines)
@@ -231,7 +231,7 @@ def _points(rows: TextRows, noun: str) -> PhotoModelerBlock:
 
 def _marks(rows: TextRows, names: Mapping[int, str]) -> PhotoModelerBlock:
     ids, values, lines, photos = [], [], [], []
-    for row in _block(rows):
+    for row in _block_rows(rows):
         photo = row.integer(0, "the number of a photograph")
         if photo not in names:
             raise row.error(
@@ -245,23 +245,23 @@ def _marks(rows: TextRows, names: Mapping[int, str]) -> PhotoModelerBlock:
     return PhotoModelerBlock(ids, np.array(values).reshape(-1, 4), lines, photos)
 
 
-def _block(rows: TextRows) -> Iterator[TextRow]:
+def _block_rows(rows: TextRows) -> Iterator[TextRow]:
     """Lines to the next empty one; without it the file is truncated."""
     while True:
-        row = _take(rows, "an empty line after the last of a block")
+        row = _take_numbers(rows, "an empty line after the last of a block")
         if not row.words:
             return
         yield row
 
 
-def _take(rows: TextRows, noun: str) -> TextRow:
+def _take_numbers(rows: TextRows, expected: str) -> TextRow:
     """The next line of numbers, a decimal comma read as a point."""
-    row = rows.take(noun)
+    row = rows.take(expected)
     return TextRow(row.path, row.number, row.text.replace(",", ".")) if "," in row.text else row
 
 
-def _names(files: Sequence[str]) -> list[str]:
+def _file_names(files: Sequence[str]) -> list[str]:
     """File names without their folders, if they differ; a repeated file is numbered."""
-    short = [ntpath.basename(name) for name in files]  # paths of Windows, on any system
-    names = short if len(set(short)) == len(short) else list(files)
+    base_names = [ntpath.basename(name) for name in files]  # paths of Windows, on any system
+    names = base_names if len(set(base_names)) == len(base_names) else list(files)
     return [f"{name}#{k}" if names.count(name) > 1 else name for k, name in enumerate(names)]

@@ -34,18 +34,19 @@ def header_camera(row: TextRow) -> tuple[Inner, Inner] | None:
 def photo_camera(row: TextRow, header: tuple[Inner, Inner] | None) -> tuple[Inner, Inner]:
     """The camera of a photograph (number, then ten values), and half a unit of its last decimals:
     the header's if it is the same."""
-    own_values, half_units = row.numbers(INNER, 1), _half_units(row.words[1:])
-    if (
-        header is not None and (abs(header[0] - own_values) <= (1 + 1e-9) * half_units).all()
-    ):  # a tie is half
+    photo_values, half_units = row.numbers(INNER, 1), _half_units(row.words[1:])
+    # A tie is half a unit.
+    if header is not None and (abs(header[0] - photo_values) <= (1 + 1e-9) * half_units).all():
         return header
-    return own_values, half_units
+    return photo_values, half_units
 
 
 def _half_units(words: Sequence[str]) -> Inner:
     # The file prints c, xp, yp with 3 decimals and the rest with 5; a bare 0 has them too.
-    printed = (3, 3, 3, 5, 5, 5, 5, 5, 5, 5)
-    return 0.5 * 10.0 ** -np.maximum([_decimals(word) for word in words], printed).astype(float)
+    printed_decimals = (3, 3, 3, 5, 5, 5, 5, 5, 5, 5)
+    return 0.5 * 10.0 ** -np.maximum([_decimals(word) for word in words], printed_decimals).astype(
+        float
+    )
 
 
 def _decimals(word: str) -> int:
@@ -82,7 +83,7 @@ def rounding_warnings(
     **Arguments:** `half_units` half a unit of the last decimal of each value; `max_effect`: about
     the precision of a good image point, which rounding should not exceed."""
     warnings = []
-    for camera, open in zip(cameras, half_units):
+    for camera, rounding in zip(cameras, half_units):
         size, pixel = np.array(camera.image_size, float), np.array(camera.pixel_size)
         r = float(np.linalg.norm(size * pixel)) / 2
         # Derivatives of the image in the corner by the parameters, mm: ∂x/∂c = r/c, ∂Δr/∂K1 = r³ ….
@@ -94,18 +95,19 @@ def rounding_warnings(
             "P1": 3 * r**2,
             "P2": 3 * r**2,
         }
-        costs = {
-            name: open[INNER.index(name)] * slope / pixel.min()
+        effects = {
+            name: rounding[INNER.index(name)] * slope / pixel.min()
             for name, slope in slopes.items()
             if camera.parameters[name] != 0 and name not in camera.free
         }
-        coarse = {name: cost for name, cost in costs.items() if cost > max_effect}
-        if coarse:
-            costs = (f"{name} to {cost:.2g} px" for name, cost in coarse.items())
-            worst = list_some(costs, as_text=str)
+        large_effects = {name: effect for name, effect in effects.items() if effect > max_effect}
+        if large_effects:
+            effects = (f"{name} to {effect:.2g} px" for name, effect in large_effects.items())
+            effects_text = list_some(effects, as_text=str)
             warnings.append(
                 f"the file rounds camera {camera.id!r}: in the corner of the image this leaves "
-                f"open {worst}; give more digits (--set camera.{camera.id}.{next(iter(coarse))}=…) "
-                f"or free them (--set camera.{camera.id}.free={','.join(coarse)})"
+                f"open {effects_text}; give more digits (--set "
+                f"camera.{camera.id}.{next(iter(large_effects))}=…) or free them (--set "
+                f"camera.{camera.id}.free={','.join(large_effects)})"
             )
     return warnings

@@ -45,54 +45,60 @@ def renumber_smart(path: Path, objects: PhotoModelerBlock, marks: PhotoModelerBl
     **Raises:** `InputError` for an id that is in the object points three times, or once and
     cannot be assigned to one of its two points.
     """
-    smart = (marks.values[:, 2:] == 0).all(1)
-    of_smart = {id for id, s in zip(marks.id, smart) if s}
-    of_others = {id for id, s in zip(marks.id, smart) if not s}
-    listed: dict[str, list[int]] = {}
+    is_smart = (marks.values[:, 2:] == 0).all(1)
+    smart_ids = {id for id, s in zip(marks.id, is_smart) if s}
+    manual_ids = {id for id, s in zip(marks.id, is_smart) if not s}
+    rows_by_id: dict[str, list[int]] = {}
     for k, id in enumerate(objects.id):
-        listed.setdefault(id, []).append(k)
-    repeated = of_smart & (of_others | {id for id, rows in listed.items() if len(rows) > 1})
-    if not repeated:
+        rows_by_id.setdefault(id, []).append(k)
+    repeated_ids = smart_ids & (
+        manual_ids | {id for id, rows in rows_by_id.items() if len(rows) > 1}
+    )
+    if not repeated_ids:
         return ""
-    factor = 10 ** max(len(id) for id in (*objects.id, *marks.id))  # above every id
-    new_id = {id: str(factor + int(id)) for id in sorted(repeated, key=int)}
-    for k in _find_smart_rows(path, objects, listed, repeated, of_smart, of_others):
-        objects.id[k] = new_id[objects.id[k]]
-    marks.id[:] = [new_id.get(id, id) if s else id for id, s in zip(marks.id, smart)]
+    id_offset = 10 ** max(len(id) for id in (*objects.id, *marks.id))  # above every id
+    new_ids = {id: str(id_offset + int(id)) for id in sorted(repeated_ids, key=int)}
+    for k in _find_smart_rows(path, objects, rows_by_id, repeated_ids, smart_ids, manual_ids):
+        objects.id[k] = new_ids[objects.id[k]]
+    marks.id[:] = [new_ids.get(id, id) if s else id for id, s in zip(marks.id, is_smart)]
     return (
-        f"{count(len(new_id), 'smart point')} had the id of another point and "
-        f"{'was' if len(new_id) == 1 else 'were'} renumbered: "
-        f"{list_some((f'{id} is {new}' for id, new in new_id.items()), 3, str)}"
+        f"{count(len(new_ids), 'smart point')} had the id of another point and "
+        f"{'was' if len(new_ids) == 1 else 'were'} renumbered: "
+        f"{list_some((f'{id} is {new}' for id, new in new_ids.items()), 3, str)}"
     )
 
 
 def _find_smart_rows(
     path: Path,
     objects: PhotoModelerBlock,
-    listed: Mapping[str, Sequence[int]],
-    repeated: set[str],
-    of_smart: set[str],
-    of_others: set[str],
+    rows_by_id: Mapping[str, Sequence[int]],
+    repeated_ids: set[str],
+    smart_ids: set[str],
+    manual_ids: set[str],
 ) -> list[int]:
     """The rows of smart points among the object points with a repeated id: the second of two; of
     one, by the neighbouring rows."""
-    rows_of_pairs = {id: rows for id, rows in listed.items() if id in repeated and len(rows) > 1}
-    for id, rows in rows_of_pairs.items():
+    listed_twice = {
+        id: rows for id, rows in rows_by_id.items() if id in repeated_ids and len(rows) > 1
+    }
+    for id, rows in listed_twice.items():
         if len(rows) > 2:
             raise InputError(
                 f"{path}, line {objects.line[rows[2]]}: point {id!r} is in the object points "
                 f"{len(rows)} times; at most a point marked by hand and a smart point have the "
-                "same "
-                "id"
+                "same id"
             )
-    single_rows = [rows[0] for id, rows in listed.items() if id in repeated and len(rows) == 1]
-    rows_of = lambda ids: [k for id in ids for k in listed.get(id, ())]
+    single_rows = [
+        rows[0] for id, rows in rows_by_id.items() if id in repeated_ids and len(rows) == 1
+    ]
+    rows_of = lambda ids: [k for id in ids for k in rows_by_id.get(id, ())]
     first_smart = min(
-        [rows[1] for rows in rows_of_pairs.values()] + rows_of(of_smart - of_others - repeated),
+        [rows[1] for rows in listed_twice.values()]
+        + rows_of(smart_ids - manual_ids - repeated_ids),
         default=len(objects),
     )
-    last_other = max(
-        [rows[0] for rows in rows_of_pairs.values()] + rows_of(of_others - of_smart), default=-1
+    last_manual = max(
+        [rows[0] for rows in listed_twice.values()] + rows_of(manual_ids - smart_ids), default=-1
     )
     # The list has the points marked by hand, ids ascending, then the smart points, ids ascending
     # again: where they descend the first time, the second part begins.
@@ -100,14 +106,14 @@ def _find_smart_rows(
     descent = next(
         (
             k
-            for k in range(max(last_other, 0) + 1, min(first_smart + 1, len(objects)))
+            for k in range(max(last_manual, 0) + 1, min(first_smart + 1, len(objects)))
             if numbers[k] < numbers[k - 1]
         ),
         None,
     )
-    smart_rows = [rows[1] for rows in rows_of_pairs.values()]
+    smart_rows = [rows[1] for rows in listed_twice.values()]
     for k in single_rows:
-        is_after, is_before = k > first_smart, k < last_other
+        is_after, is_before = k > first_smart, k < last_manual
         if is_after == is_before and (is_after or descent is None):
             raise InputError(
                 f"{path}, line {objects.line[k]}: point {objects.id[k]!r} has image points of a "
@@ -120,24 +126,24 @@ def _find_smart_rows(
 
 
 def point_table(
-    path: Path, control: PhotoModelerBlock, objects: PhotoModelerBlock, marked: list[str]
+    path: Path, control: PhotoModelerBlock, objects: PhotoModelerBlock, marked_ids: list[str]
 ) -> Columns:
     """Control points as given, then the other object points, then points marked in
     photographs without coordinates."""
     control_ids = set(control.id)
     other_rows = [k for k, id in enumerate(objects.id) if id not in control_ids]
     known_ids = control_ids | set(objects.id)
-    marked_only = [id for id in dict.fromkeys(marked) if id not in known_ids]
+    unlisted_ids = [id for id in dict.fromkeys(marked_ids) if id not in known_ids]
     weighted = np.all(control.values[:, 3:] > 0, axis=1)
-    blank_rows = np.full((len(other_rows) + len(marked_only), 3), np.nan)
+    empty_rows = np.full((len(other_rows) + len(unlisted_ids), 3), np.nan)
     position = np.concatenate(
-        [control.values[:, :3], objects.values[other_rows, :3], blank_rows[len(other_rows) :]]
+        [control.values[:, :3], objects.values[other_rows, :3], empty_rows[len(other_rows) :]]
     )
-    sigma = np.concatenate([np.where(weighted[:, None], control.values[:, 3:], np.nan), blank_rows])
-    lines = [*control.line, *(objects.line[k] for k in other_rows), *[0] * len(marked_only)]
+    sigma = np.concatenate([np.where(weighted[:, None], control.values[:, 3:], np.nan), empty_rows])
+    lines = [*control.line, *(objects.line[k] for k in other_rows), *[0] * len(unlisted_ids)]
     columns = {
-        "id": [*control.id, *(objects.id[k] for k in other_rows), *marked_only],
-        "role": [*np.where(weighted, "control", "fixed").tolist(), *["tie"] * len(blank_rows)],
+        "id": [*control.id, *(objects.id[k] for k in other_rows), *unlisted_ids],
+        "role": [*np.where(weighted, "control", "fixed").tolist(), *["tie"] * len(empty_rows)],
         **dict(zip("XYZ", position.T)),
         **dict(zip(("sX", "sY", "sZ"), sigma.T)),
     }

@@ -59,19 +59,19 @@ def are_rotations(
     **Arguments:** `tolerance` of R·Rᵀ relative to the identity: files have six digits or so of R;
     larger, and a matrix with a typing error in its fourth digit passes.
     """
-    misfit = np.abs(R @ R.mT - np.eye(3)).max((-2, -1))
-    return np.asarray((misfit <= tolerance) & (np.linalg.det(R) > 0))
+    deviation = np.abs(R @ R.mT - np.eye(3)).max((-2, -1))
+    return np.asarray((deviation <= tolerance) & (np.linalg.det(R) > 0))
 
 
 def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
     """Refuse invalid rotation matrices.
 
     **Raises:** `InputError` beginning with `where`."""
-    good = are_rotations(R)
-    if not good.all():
-        (first_wrong, *_) = np.reshape(R, (-1, 3, 3))[~np.ravel(good)]
+    is_rotation = are_rotations(R)
+    if not is_rotation.all():
+        (first_invalid, *_) = np.reshape(R, (-1, 3, 3))[~np.ravel(is_rotation)]
         # Minus a reflection is a rotation.
-        mirror = are_rotations(-first_wrong).all()
+        mirror = are_rotations(-first_invalid).all()
         raise InputError(
             f"{where} is not a rotation matrix{', but one that mirrors' if mirror else ''}"
         )

@@ -67,7 +67,7 @@ from jaxbundle.network.build import (
 )
 from jaxbundle.network.columns import Columns, as_columns, refuse_unknown
 from jaxbundle.network.kinds import KINDS, SECTIONS
-from jaxbundle.network.kinds.base import present_kinds
+from jaxbundle.network.kinds.base import included_tables
 from jaxbundle.network.rules import AXES
 from jaxbundle.network.tables import STATED, UNIT, Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
@@ -116,10 +116,10 @@ def read_project(
         if not (oriented and table in OPTIONAL_WHERE_ORIENTED and _is_absent(document, table))
     }
     for table, columns in OPTIONAL_WHERE_ORIENTED.items() if oriented else ():
-        table_found = tables.get(table)
-        if table_found is None:
-            table_found = Columns(dict.fromkeys(columns, ()), Source(table))
-        tables[table] = dataclasses.replace(table_found, may_be_empty=True)
+        optional_table = tables.get(table)
+        if optional_table is None:
+            optional_table = Columns(dict.fromkeys(columns, ()), Source(table))
+        tables[table] = dataclasses.replace(optional_table, may_be_empty=True)
     # Points of a model without image points can be written for other programs.
     if (rays := tables.get("observations")) is not None:
         tables["observations"] = dataclasses.replace(rays, may_be_empty=True)
@@ -148,8 +148,8 @@ def project_file(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    places = (path / FILE_NAME, path / ADJUSTED / FILE_NAME)
-    return next((place for place in places if place.is_file()), places[0])
+    candidates = (path / FILE_NAME, path / ADJUSTED / FILE_NAME)
+    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
 
 
 def _read_document(path: Path) -> Document:
@@ -263,7 +263,7 @@ def fill_project(network: Network, folder: Path) -> None:
         ends = [[points.id[p] for p in column] for column in distances.points.T]
         values = np.stack([distances.value, distances.sigma], 1)
         _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
-    for kind in present_kinds(network):
+    for kind in included_tables(network):
         columns = {
             name: column
             if isinstance(column, tuple)
@@ -282,21 +282,21 @@ def _write_table(
     sigma_header: Sequence[str],
     sigma: Float[np.ndarray, "rows m"],
     words: Mapping[float, str],
-    further_columns: Mapping[str, np.ndarray] = MappingProxyType({}),
+    extra_columns: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> None:
-    """Ids, numbers and σ if given; `words` replace special values of σ; `further_columns` "
-    "columns follow."""
+    """Ids, numbers and σ if given; `words` replace special values of σ; `extra_columns`
+    follow."""
     with_sigma = bool(sigma_header) and not np.isnan(sigma).all()
-    further_cells = (
-        zip(*(column.tolist() for column in further_columns.values()))
-        if further_columns
+    extra_rows = (
+        zip(*(column.tolist() for column in extra_columns.values()))
+        if extra_columns
         else itertools.repeat(())
     )
     rows = (
-        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()), *further)
-        for *names, row, s, further in zip(*ids, values.tolist(), sigma.tolist(), further_cells)
+        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()), *extra_cells)
+        for *names, row, s, extra_cells in zip(*ids, values.tolist(), sigma.tolist(), extra_rows)
     )
-    write_csv(path, (*header, *(sigma_header if with_sigma else ()), *further_columns), rows)
+    write_csv(path, (*header, *(sigma_header if with_sigma else ()), *extra_columns), rows)
 
 
 def _cells(
@@ -314,7 +314,7 @@ def _document_text(network: Network, origin: str) -> str:
     settings = {key: getattr(network, key) for key in SETTINGS if key not in in_tables}
     if origin != STATED:
         settings["sigma_origin"] = origin
-    kinds = present_kinds(network)
+    kinds = included_tables(network)
     distances = ["distances"] * (len(network.distances) > 0)
     tables = [*REQUIRED_TABLES, *distances, *(f.TABLE for f in kinds)]
     settings |= {table: f"{table}.csv" for table in tables}

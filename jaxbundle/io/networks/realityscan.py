@@ -119,7 +119,7 @@ def is_realityscan(path: Path) -> bool:
     for line in beginning(path, 10_000).decode("utf-8", errors="replace").splitlines():
         if not line.strip() or line.startswith("#cameras"):
             continue
-        return {*REQUIRED} <= {*_names(line)}
+        return {*REQUIRED} <= {*_column_names(line)}
     return False
 
 
@@ -138,23 +138,23 @@ def read_realityscan(
     **Raises:** `InputError` naming file and field.
     """
     path, unknown = Path(path), UnknownKeys()
-    read_rows = _read_folder if path.is_dir() else _read_table
-    rows = list(read_rows(path, unknown, image_size))
+    reader = _read_folder if path.is_dir() else _read_table
+    rows = list(reader(path, unknown, image_size))
     if not rows:
         raise InputError(f"{path}: there are no cameras")
     # Each photograph states its own numbers: equal ones are of one camera.
     cameras: dict[tuple, Camera] = {}
-    camera_of_image = []
+    camera_ids = []
     for row in rows:
         key = (row.size, tuple(row.parameters.items()))
         if key not in cameras:
             cameras[key] = _camera(str(len(cameras) + 1), row)
-        camera_of_image.append(cameras[key].id)
+        camera_ids.append(cameras[key].id)
     names = unique_labels([row.name for row in rows], range(len(rows)))
     images = image_columns(
         Source(str(path), None, "camera"),
         names,
-        camera_of_image,
+        camera_ids,
         np.array([row.M for row in rows]),
         np.array([row.X0 for row in rows]),
     )
@@ -181,20 +181,20 @@ def _camera(id: str, row: Row) -> Camera:
     return Camera(id, "opencv", core, image_size=row.size, tie=(("fx", "fy"),))
 
 
-def _size(
-    folder: Path, name: str, given_size: Sequence[float] | None, where: str
+def _size_and_name(
+    folder: Path, name: str, image_size: Sequence[float] | None, where: str
 ) -> tuple[tuple[int, int], str]:
     """The size of a photograph, and its name with suffix if it is beside."""
     # XMP files have the stem of their photograph only
     for file in (folder / name, *(folder / f"{name}{suffix}" for suffix in PHOTOGRAPHS)):
         if file.suffix.lower() in PHOTOGRAPHS and file.is_file():
             return photograph_size(file), file.name
-    if given_size is None:
+    if image_size is None:
         raise InputError(
             f"{where}: the size of the photograph is missing; expected {name} beside it, or "
             "--image-size W,H (convert, camera)"
         )
-    w, h = (int(n) for n in given_size)
+    w, h = (int(n) for n in image_size)
     return (w, h), name
 
 
@@ -202,15 +202,15 @@ def _size(
 
 
 def _read_folder(
-    folder: Path, unknown: UnknownKeys, given_size: Sequence[float] | None
+    folder: Path, unknown: UnknownKeys, image_size: Sequence[float] | None
 ) -> Iterator[Row]:
     for path in sorted(folder.glob(FILES[0])):
         fields = _fields(path)
         if not fields:
             continue  # of another program
-        own_name = fields.pop(OWN_NAME, path.stem)
+        photograph_name = fields.pop(OWN_NAME, path.stem)
         unknown.check(fields, XMP_KEYS, path)
-        size, name = _size(folder, own_name, given_size, str(path))
+        size, name = _size_and_name(folder, photograph_name, image_size, str(path))
         yield Row(name, size, _interior(path, fields), *_pose(path, fields), str(path))
 
 
@@ -221,12 +221,12 @@ def _fields(path: Path) -> dict[str, str]:
         return {}
     fields = {}
     # The namespaces of elements are removed by the reader: their names are those of the file.
-    own_names = {*re.findall(r"<xcr:(\w+)", text)}
+    xcr_tags = {*re.findall(r"<xcr:(\w+)", text)}
     for element in read_xml(path).iter():
         for key, value in element.attrib.items():
             if key.startswith(f"{{{NAMESPACE}}}") or key == f"{{{MEDIA}}}{OWN_NAME}":
                 fields[key.rpartition("}")[2]] = value
-        if element.tag in own_names:
+        if element.tag in xcr_tags:
             fields[element.tag] = element.text or ""
     return fields
 
@@ -254,9 +254,9 @@ def _interior(path: Path, fields: Mapping[str, str]) -> dict[str, float]:
     k = np.zeros(6)
     if model != "perspective" and "DistortionCoeficients" in fields:
         k = _numbers(path, fields, "DistortionCoeficients", 6)
-    fields_found = {"f": number("FocalLength35mm", "0")}
-    fields_found |= {"px": number("PrincipalPointU", "0"), "py": number("PrincipalPointV", "0")}
-    return fields_found | dict(zip((*RADIAL, *TANGENTIAL), k.tolist()))
+    interior = {"f": number("FocalLength35mm", "0")}
+    interior |= {"px": number("PrincipalPointU", "0"), "py": number("PrincipalPointV", "0")}
+    return interior | dict(zip((*RADIAL, *TANGENTIAL), k.tolist()))
 
 
 def _pose(path: Path, fields: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray]:
@@ -271,17 +271,17 @@ def _pose(path: Path, fields: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray
 # --- table ----------------------------------------------------------------------------------
 
 
-def _names(line: str) -> list[str]:
+def _column_names(line: str) -> list[str]:
     return [name.strip().lstrip("#").strip().lower() for name in line.split(",")]
 
 
 def _read_table(
-    path: Path, unknown: UnknownKeys, given_size: Sequence[float] | None
+    path: Path, unknown: UnknownKeys, image_size: Sequence[float] | None
 ) -> Iterator[Row]:
     # Its header begins with #, as comments of our tables do.
     text = re.sub(r"^\s*#\s*(?=name\s*,)", "", read_text(path), count=1, flags=re.M | re.I)
     table = parse_csv(path, text)
-    columns = {_names(name)[0]: name for name in table.values}
+    columns = {_column_names(name)[0]: name for name in table.values}
     unknown.check(columns, TABLE_KEYS, path)
     table = Columns({key: table.values[name] for key, name in columns.items()}, table.source)
     names = table.ids("name")
@@ -292,13 +292,13 @@ def _read_table(
     }
     for k, name in enumerate(names):
         where = table.source(k)
-        size, photograph = _size(path.parent, name, given_size, where)
+        size, photograph = _size_and_name(path.parent, name, image_size, where)
         parameters = {key: float(column[k]) for key, column in interior.items()}
-        M = _from_heading(*np.radians(pose[k, 3:])).T
+        M = _rotation_from_heading(*np.radians(pose[k, 3:])).T
         yield Row(photograph, size, parameters, M, pose[k, :3], where)
 
 
-def _from_heading(heading: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
+def _rotation_from_heading(heading: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
     """R_z(−heading)·R_x(pitch)·R_y(roll)."""
     ch, sh, cp, sp, cr, sr = (f(a) for a in (heading, pitch, roll) for f in (math.cos, math.sin))
     Rz = np.array([[ch, sh, 0], [-sh, ch, 0], [0, 0, 1]])
@@ -322,25 +322,25 @@ def _heading_of(R: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
 # --- writing --------------------------------------------------------------------------------
 
 
-def _as_written(camera: Camera, largest_difference: float = 0.5) -> dict[str, float]:
+def _written_interior(camera: Camera, largest_difference: float = 0.5) -> dict[str, float]:
     """The interior orientation in the units of the program; `largest_difference`: what one focal
     length instead of two may change, pixels: rounding to whole ones does as much."""
     p = check_others_zero(camera, "RealityScan", ("k1", "k2", "k3", "p1", "p2"))
     w, h = size_of(camera, "RealityScan")
     # An adjusted camera has two focal lengths that differ by their σ.
-    f, difference = math.sqrt(p["fx"] * p["fy"]), _focal_difference(camera)
-    if difference > largest_difference:
+    f, focal_difference = math.sqrt(p["fx"] * p["fy"]), _focal_difference(camera)
+    if focal_difference > largest_difference:
         raise InputError(
             f"camera {camera.id!r}: RealityScan has one focal length, but fx is {p['fx']:.9g} and "
-            f"fy {p['fy']:.9g}, {difference:.2g} px at the edge of the image; adjust the camera "
-            "with "
+            f"fy {p['fy']:.9g}, {focal_difference:.2g} px at the edge of the image; adjust the "
+            "camera with "
             'tie = [["fx", "fy"]]'
         )
     side = max(w, h)
-    fields_written = {"f": f / side * SMALL_FORMAT[0]}
-    fields_written |= {"px": (p["cx"] + PIXEL_CENTRE - w / 2) / side}
-    fields_written |= {"py": (p["cy"] + PIXEL_CENTRE - h / 2) / side}
-    return fields_written | {"k1": p["k1"], "k2": p["k2"], "k3": p["k3"], "k4": 0.0} | {
+    interior = {"f": f / side * SMALL_FORMAT[0]}
+    interior |= {"px": (p["cx"] + PIXEL_CENTRE - w / 2) / side}
+    interior |= {"py": (p["cy"] + PIXEL_CENTRE - h / 2) / side}
+    return interior | {"k1": p["k1"], "k2": p["k2"], "k3": p["k3"], "k4": 0.0} | {
         "t1": p["p1"], "t2": p["p2"]
     }  # fmt: skip
 
@@ -353,9 +353,9 @@ def _focal_difference(camera: Camera) -> float:
 
 
 def _losses(network: Network) -> tuple[str, ...]:
-    largest_difference = max((_focal_difference(camera) for camera in network.cameras), default=0.0)
-    loss = f"the difference of fx and fy (largest change in an image {largest_difference:.2g} px)"
-    return (*describe_losses(network, REALITYSCAN_LOSSES), *([loss] if largest_difference else []))
+    focal_difference = max((_focal_difference(camera) for camera in network.cameras), default=0.0)
+    message = f"the difference of fx and fy (largest change in an image {focal_difference:.2g} px)"
+    return (*describe_losses(network, REALITYSCAN_LOSSES), *([message] if focal_difference else []))
 
 
 def write_realityscan_csv(network: Network, path: str | Path) -> tuple[str, ...]:
@@ -366,7 +366,7 @@ def write_realityscan_csv(network: Network, path: str | Path) -> tuple[str, ...]
     """
     need_values(network, "opencv", "RealityScan", points=False)
     images = network.images
-    interior = [_as_written(camera) for camera in network.cameras]
+    interior = [_written_interior(camera) for camera in network.cameras]
     rows = [
         (id, *X0, *_heading_of(M.T), *(interior[c][key] for key in HEADER[len(POSE) + 1 :]))
         for id, X0, M, c in zip(
@@ -403,13 +403,15 @@ def fill_realityscan(network: Network, folder: Path) -> tuple[str, ...]:
     images = network.images
     names = [Path(id).stem if Path(id).suffix.lower() in PHOTOGRAPHS else id for id in images.id]
     names = [name.replace("/", "_") for name in names]
-    twice = next((name for name in names if names.count(name) > 1 or not name.strip(".")), None)
-    if twice is not None:
-        raise InputError(f"{folder}: image {twice!r} does not give a unique file name")
-    interior = [_as_written(camera) for camera in network.cameras]
+    ambiguous_name = next(
+        (name for name in names if names.count(name) > 1 or not name.strip(".")), None
+    )
+    if ambiguous_name is not None:
+        raise InputError(f"{folder}: image {ambiguous_name!r} does not give a unique file name")
+    interior = [_written_interior(camera) for camera in network.cameras]
     R = flip_rows(matrices_of(images.angles))
     texts = [
-        _xmp(id, interior[c], rotation, X0, c)
+        _xmp_text(id, interior[c], rotation, X0, c)
         for id, c, rotation, X0 in zip(images.id, images.camera.tolist(), R, images.position)
     ]
     folder.mkdir(exist_ok=True)
@@ -418,7 +420,7 @@ def fill_realityscan(network: Network, folder: Path) -> tuple[str, ...]:
     return _losses(network)
 
 
-def _xmp(id: str, p: Mapping[str, float], R: np.ndarray, X0: np.ndarray, group: int) -> str:
+def _xmp_text(id: str, p: Mapping[str, float], R: np.ndarray, X0: np.ndarray, group: int) -> str:
     numbers = lambda values: " ".join(repr(float(v)) for v in values)
     coefficients = [p[name] for name in (*RADIAL, *TANGENTIAL)]
     # A model without tangential terms would drop them.

@@ -91,8 +91,8 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         if row["converged"] is not True:
             raise InputError(f"{where}: was not solved ({row['status']})")
         mountings = {
-            label.rpartition(" of ")[0]: {name: x["value"] for name, x in estimates.items()}
-            for label, estimates in row["further_unknowns"]["mounting"].items()
+            label.rpartition(" of ")[0]: {name: x["value"] for name, x in parameters.items()}
+            for label, parameters in row["further_unknowns"]["mounting"].items()
         }
         cameras, pixel = [], row.get("settings", {}).get("pixel_size")
         for id in mountings:
@@ -101,13 +101,13 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             cameras.append(_camera(where, id, entry["parameters"], entry["model"], sizes))
         bases = [np.array([m[x] for x in ("X0", "Y0", "Z0")]) for m in mountings.values()]
         angles = np.array([[m[x] for x in ("omega", "phi", "kappa")] for m in mountings.values()])
-        turns = [np.asarray(matrix_from_omega_phi_kappa(row)) for row in angles]
+        rotations = [np.asarray(matrix_from_omega_phi_kappa(row)) for row in angles]
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        fault = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
-        raise InputError(f"{where}: not a line of jaxbundle batch --rig: {fault}") from None
-    return network_of_rig(file, cameras, turns, bases, overrides)
+        problem = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{where}: not a line of jaxbundle batch --rig: {problem}") from None
+    return network_of_rig(file, cameras, rotations, bases, overrides)
 
 
 def _rows(file: Path) -> Iterator[dict[str, Any]]:
@@ -142,15 +142,15 @@ def read_rig_result(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             sizes = parts[id].get("calibration", {})
             cameras.append(_camera(str(path), id, rig["cameras"][id], entry["model"], sizes))
         bases = [np.array(m["base"], float).reshape(3) for m in mountings.values()]
-        turns = [np.array(m["rotation"], float).reshape(3, 3) for m in mountings.values()]
+        rotations = [np.array(m["rotation"], float).reshape(3, 3) for m in mountings.values()]
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        fault = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
-        raise InputError(f"{path}: not the result of calibrate --rig: {fault}") from None
-    for turn in turns:
-        check_rotations(turn, f"{path}: rig.mountings, rotation")
-    return network_of_rig(path, cameras, turns, bases, overrides)
+        problem = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{path}: not the result of calibrate --rig: {problem}") from None
+    for rotation in rotations:
+        check_rotations(rotation, f"{path}: rig.mountings, rotation")
+    return network_of_rig(path, cameras, rotations, bases, overrides)
 
 
 def network_of_rig(
@@ -165,8 +165,8 @@ def network_of_rig(
     X_k = R·(X − b) in our frames is x_k = (D·R·D)·x − D·R·b in those with y down, z forward.
     """
     flip = np.diag(D)
-    R = [flip @ turn @ flip for turn in rotations]
-    t = [-flip @ turn @ base for turn, base in zip(rotations, bases)]
+    R = [flip @ rotation @ flip for rotation in rotations]
+    t = [-flip @ rotation @ base for rotation, base in zip(rotations, bases)]
     return rig_network(path, cameras, R, t, overrides, warnings=[IN_BOARD_UNITS], unit=UNIT)
 
 

@@ -62,35 +62,35 @@ def apply_overrides(
             value = _words(text) if key == "datum_points" else text
             document["project"][key] = _number(key, text) if key == "sigma_image" else value
         else:
-            raise InputError(f"--set {key}: unknown key{_known_keys(key, keys)}")
+            raise InputError(f"--set {key}: unknown key{_describe_keys(key, keys)}")
     return document
 
 
-def _known_keys(key: str, keys: Sequence[str]) -> str:
+def _describe_keys(key: str, keys: Sequence[str]) -> str:
     """The end of a message about an unknown key: all of them, and the probable one."""
-    section, dot, after_dot = key.partition(".")
-    known_keys = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
+    section, dot, subkey = key.partition(".")
+    allowed_keys = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
     close = closest_name(section, ("camera", *SECTIONS) if dot else (*keys, "free"))
-    suggestion = "" if close is None else f"; did you mean {f'{close}{dot}{after_dot}'!r}?"
-    return f"; known: {', '.join(known_keys)}{suggestion}"
+    suggestion = "" if close is None else f"; did you mean {f'{close}{dot}{subkey}'!r}?"
+    return f"; known: {', '.join(allowed_keys)}{suggestion}"
 
 
 def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
     """Apply a setting to the camera named by the key, or to all cameras."""
-    after_camera = key.removeprefix("camera.")
+    subkey = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
     # The longest id first: "a.b" may be an id beside "a".
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
-        if after_camera.startswith(f"{ids[c]}."):
-            _override_camera(cameras[c], key, after_camera.removeprefix(f"{ids[c]}."), text)
+        if subkey.startswith(f"{ids[c]}."):
+            _override_camera(cameras[c], key, subkey.removeprefix(f"{ids[c]}."), text)
             return
-    if not after_camera.startswith(f"{ALL_CAMERAS}."):
+    if not subkey.startswith(f"{ALL_CAMERAS}."):
         raise InputError(
             f"--set {key}: no such camera; known: "
             f"{list_some((f'camera.{id}.PARAMETER' for id in (*ids, ALL_CAMERAS)), 12, str)}"
         )
     for camera in cameras:
-        _override_camera(camera, key, after_camera.removeprefix(f"{ALL_CAMERAS}."), text)
+        _override_camera(camera, key, subkey.removeprefix(f"{ALL_CAMERAS}."), text)
 
 
 def _override_camera(camera: dict, key: str, field: str, text: str) -> None:

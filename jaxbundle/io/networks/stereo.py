@@ -96,20 +96,20 @@ def rectify(
         raise InputError("both cameras are at one position; expected a base between them")
     base = -R.T @ T / length  # from the first to the second, in the first's frame
     k = int(np.abs(base[:2]).argmax())  # the axis along the base, pointing as the camera's own
-    new_axis = base * np.sign(base[k])
+    base_axis = base * np.sign(base[k])
     axes = np.array([[0, 0, 1.0], R[2]])  # both optical axes, in the first's frame
     z = axes.sum(0)
-    z = z - (z @ new_axis) * new_axis
+    z = z - (z @ base_axis) * base_axis
     # Each optical axis needs an image in the common plane, so that it is less than 90° from z.
     # 1e-6, of unit vectors: rounding of a base along an axis, and of opposite axes.
-    if not new_axis.any() or (axes @ z <= 1e-6).any():
+    if not base_axis.any() or (axes @ z <= 1e-6).any():
         raise InputError(
             "one camera looks along the base or away from the other; they have no common "
             "rectified image"
         )
     z = z / np.linalg.norm(z)
     # Right-handed: x × y = z, whichever of both lies along the base.
-    rows = [new_axis, np.cross(z, new_axis)] if k == 0 else [np.cross(new_axis, z), new_axis]
+    rows = [base_axis, np.cross(z, base_axis)] if k == 0 else [np.cross(base_axis, z), base_axis]
     R1 = np.stack([*rows, z])
     R2 = R1 @ R.T
     p = [all_parameters(camera) for camera in cameras]
@@ -128,27 +128,27 @@ def _file_names(cameras: Sequence[Camera]) -> list[str]:
     **Raises:** `InputError` if two are equal."""
     names = [re.sub(r"[^\w.-]+", "_", camera.id) or "camera" for camera in cameras]
     # Some systems do not distinguish capital letters.
-    folded = [name.casefold() for name in names]
-    for k, name in enumerate(folded):
-        if name in folded[:k]:
-            both_names = f"{cameras[folded.index(name)].id!r} and {cameras[k].id!r}"
+    folded_names = [name.casefold() for name in names]
+    for k, name in enumerate(folded_names):
+        if name in folded_names[:k]:
+            equal_pair = f"{cameras[folded_names.index(name)].id!r} and {cameras[k].id!r}"
             raise InputError(
-                f"the names of the cameras {both_names} give the same file {names[k]}.yaml"
+                f"the names of the cameras {equal_pair} give the same file {names[k]}.yaml"
             )
     return names
 
 
-def _pairs(network: Network, subject: str) -> list[StereoPair]:
+def _pairs(network: Network, format_name: str) -> list[StereoPair]:
     """Every camera with the first.
 
     **Raises:** `InputError` for a single camera, and for cameras without mountings."""
     cameras = network.cameras
     if len(cameras) < 2:
-        raise InputError(f"{subject} holds two cameras, got {len(cameras)}")
+        raise InputError(f"{format_name} holds two cameras, got {len(cameras)}")
     mountings = mountings_of(network)
     if mountings is None:
         raise InputError(
-            f"{subject} holds the mounting of two cameras; expected a rig, or one image of each"
+            f"{format_name} holds the mounting of two cameras; expected a rig, or one image of each"
         )
     names, T, pairs = _file_names(cameras), np.eye(4), []
     for camera, name, step in zip(cameras[1:], names[1:], mountings):
@@ -165,10 +165,10 @@ STEREO_LOSSES = mounted_losses()
 def opencv_stereo_files(network: Network, path: Path) -> tuple[Path, ...]:
     """The file of each pair of a rig; of two cameras the path itself."""
     pairs = _pairs(network, "a stereo file of OpenCV")
-    return tuple(_file_of(pair, path) for pair in pairs)
+    return tuple(_output_file(pair, path) for pair in pairs)
 
 
-def _file_of(pair: StereoPair, path: Path) -> Path:
+def _output_file(pair: StereoPair, path: Path) -> Path:
     return path.with_name(f"{path.stem}_{pair.name}{path.suffix}") if pair.name else path
 
 
@@ -193,7 +193,7 @@ def write_opencv_stereo(network: Network, path: str | Path) -> tuple[str, ...]:
             entries |= {name: (*M.shape, M.ravel()) for name, M in rectified._asdict().items()}
             entries |= {"Q": (4, 4, rectified.Q.ravel())}
         texts.append(file_text(entries, path.suffix.lower() == ".json"))
-    write_texts([_file_of(pair, path) for pair in pairs], texts)
+    write_texts([_output_file(pair, path) for pair in pairs], texts)
     return (*describe_losses(network, STEREO_LOSSES), *losses)
 
 
@@ -203,18 +203,15 @@ def _stereo_entries(pair: StereoPair) -> dict[str, Any]:
         raise InputError(f"a stereo file of OpenCV has one camera model, got {', '.join(kinds)}")
     entries: dict[str, Any] = {}
     for k, camera in enumerate(pair.cameras, 1):
-        entries_of_camera = opencv_entries(camera)
+        camera_entries = opencv_entries(camera)
         names = NAMES[2 * k - 2 : 2 * k]
         w, h = size_of(camera, "OpenCV")
         entries |= {f"image_width_{k}": w, f"image_height_{k}": h, f"camera_name_{k}": camera.id}
         entries |= dict(
-            zip(
-                names,
-                (entries_of_camera["camera_matrix"], entries_of_camera["distortion_coefficients"]),
-            )
+            zip(names, (camera_entries["camera_matrix"], camera_entries["distortion_coefficients"]))
         )
         entries |= {
-            name: entries_of_camera[name] for name in FISHEYE_ENTRIES if name in entries_of_camera
+            name: camera_entries[name] for name in FISHEYE_ENTRIES if name in camera_entries
         }
     return entries | {"R": (3, 3, pair.R.ravel()), "T": (3, 1, pair.T)}
 
@@ -232,22 +229,22 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
     **Returns, raises:** as `write_opencv_stereo`; `InputError` if no pair can be rectified.
     """
     pairs = _pairs(network, "a pair of ROS")
-    texts, refusals = {}, []
+    texts, failures = {}, []
     for pair in pairs:
         try:
             rectified = rectify(*pair[:3])
         except InputError as error:
-            refusals.append(f"pair of {pair}: {error}")
+            failures.append(f"pair of {pair}: {error}")
             continue
         parts = ((rectified.R1, rectified.P1), (rectified.R2, rectified.P2))
         for camera, name, part in zip(pair.cameras, _file_names(pair.cameras), parts):
             texts[folder / pair.name / f"{name}.yaml"] = ros_text(camera, *part)
     if not texts:
-        raise InputError("; ".join(refusals))
+        raise InputError("; ".join(failures))
     for file in texts:
         file.parent.mkdir(parents=True, exist_ok=True)
     write_texts([*texts], [*texts.values()])
-    return (*describe_losses(network, STEREO_LOSSES), *refusals)
+    return (*describe_losses(network, STEREO_LOSSES), *failures)
 
 
 def is_ros_stereo(path: Path) -> bool:
@@ -297,11 +294,13 @@ def read_ros_stereo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(f"{path}: {len(parts)} cameras; expected two")
     # The one without a shift is the first, whatever the files are called.
     parts.sort(key=lambda part: bool(part[2].any()))
-    (left, R1, no_shift), (right, R2, shift) = parts
-    if no_shift.any() or not shift.any():
+    (left, R1, left_shift), (right, R2, shift) = parts
+    if left_shift.any() or not shift.any():
         raise InputError(
             f"{path}: expected the projection_matrix of one camera with and of the other without "
-            f"a shift in its last column, got {'two' if no_shift.any() else 'none'} with"
+            f"a shift in its last column, got {'two' if left_shift.any() else 'none'} with"
         )
-    turns, shifts = [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift]
-    return rig_network(path, [left, right], turns, shifts, overrides, fit_messages([left, right]))
+    rotations, translations = [np.eye(3), R2.T @ R1], [np.zeros(3), R2.T @ shift]
+    return rig_network(
+        path, [left, right], rotations, translations, overrides, fit_messages([left, right])
+    )

@@ -129,8 +129,8 @@ def read_transforms(
     if image_size is not None and file.get("w") is None and file.get("h") is None:
         file.document |= dict(zip("wh", image_size))
     cameras: dict[str, Camera] = {}
-    names, camera_of_frame, M, X0, lost_frames = [], [], [], [], []
-    why = None
+    names, camera_ids, M, X0, omitted_frames = [], [], [], [], []
+    camera_error = None
     for frame in file.rows("frames"):
         unknown.check(frame.document, FRAME_KEYS, frame.path)
         name, fields = frame.text("file_path"), _intrinsics(file, frame)
@@ -140,30 +140,33 @@ def read_transforms(
             if key not in cameras:
                 cameras[key] = _camera(str(len(cameras) + 1), fields)
         except NoPlaceError as error:
-            why, lost_frames = error, [*lost_frames, name]
+            camera_error, omitted_frames = error, [*omitted_frames, name]
             continue
         T = frame.array("transform_matrix", (None, 4))
         if len(T) not in (3, 4):
             raise InputError(f"{frame.path}: transform_matrix has {len(T)} rows; expected 4")
         check_rotations(T[:3, :3], f"{frame.path}: transform_matrix")
         names.append(name)
-        camera_of_frame.append(cameras[key].id)
+        camera_ids.append(cameras[key].id)
         # The file has camera → world, M world → camera.
         M.append(T[:3, :3].T)
         X0.append(T[:3, 3])
     if not names:
-        raise why or InputError(f"{path}: there are no frames")
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice:
-        raise InputError(f"{path}: two frames have the file_path {twice!r}")
+        raise camera_error or InputError(f"{path}: there are no frames")
+    repeated_name = next((name for name in names if names.count(name) > 1), None)
+    if repeated_name:
+        raise InputError(f"{path}: two frames have the file_path {repeated_name!r}")
     messages = (
-        [f"{why}; left out {count(len(lost_frames), 'frame')}: {list_some(lost_frames)}"]
-        if lost_frames
+        [
+            f"{camera_error}; left out {count(len(omitted_frames), 'frame')}: "
+            f"{list_some(omitted_frames)}"
+        ]
+        if omitted_frames
         else []
     )
     messages += unknown.messages()
     images = image_columns(
-        Source(str(path), None, "frame"), names, camera_of_frame, np.array(M), np.array(X0)
+        Source(str(path), None, "frame"), names, camera_ids, np.array(M), np.array(X0)
     )
     document = foreign_document(path.stem, map(entry_of, cameras.values()))
     return assemble(
@@ -177,15 +180,13 @@ def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
     values = {}
     for source in (file, frame):  # the frame's own replace those of the file
         for name in INTRINSICS:
-            spellings_given = [
+            spellings = [
                 k for k in (name, OTHER_NAMES.get(name, name)) if source.get(k) is not None
             ]
-            if len({str(source.get(k)) for k in spellings_given}) > 1:
-                raise InputError(
-                    f"{source.path}: {' and '.join(spellings_given)} differ; expected one"
-                )
-            if spellings_given:
-                values[name] = source.get(spellings_given[0])
+            if len({str(source.get(k)) for k in spellings}) > 1:
+                raise InputError(f"{source.path}: {' and '.join(spellings)} differ; expected one")
+            if spellings:
+                values[name] = source.get(spellings[0])
     return JsonFields(frame.path if has_own else file.path, values)
 
 
@@ -200,12 +201,12 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     model, names = MODELS[kind]
     size = None
     if fields.get("w") is not None or fields.get("h") is not None:
-        size = fields.integer("w", least=1), fields.integer("h", least=1)
+        size = fields.integer("w", minimum=1), fields.integer("h", minimum=1)
     # Either axis may be the one that is given.
-    given_axis, other_axis = "xy" if any(fields.get(f"{n}_x") is not None for n in FOCAL) else "yx"
+    first_axis, other_axis = "xy" if any(fields.get(f"{n}_x") is not None for n in FOCAL) else "yx"
     side = dict(zip("xy", size or (None, None)))
-    f = {given_axis: _focal_length(fields, given_axis, side[given_axis], None)}
-    f[other_axis] = _focal_length(fields, other_axis, side[other_axis], f[given_axis])
+    f = {first_axis: _focal_length(fields, first_axis, side[first_axis], None)}
+    f[other_axis] = _focal_length(fields, other_axis, side[other_axis], f[first_axis])
     fx, fy = f["x"], f["y"]
     c = [_principal_point(fields, axis, side[axis]) - PIXEL_CENTRE for axis in "xy"]
     core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))

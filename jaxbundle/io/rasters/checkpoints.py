@@ -48,10 +48,10 @@ class Checkpoint:
         head = self._file.read(RECORD.size)
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if len(head) == RECORD.size:
-            number_found, length, check = RECORD.unpack(head)
-            if number_found == number and length in (0, size):
+            stored_number, length, checksum = RECORD.unpack(head)
+            if stored_number == number and length in (0, size):
                 content = self._file.read(length)
-                if len(content) == length and zlib.crc32(content) == check:
+                if len(content) == length and zlib.crc32(content) == checksum:
                     values = np.frombuffer(content, dtype)
                     return values.reshape(shape) if length else values
         self._kept = False
@@ -90,19 +90,19 @@ def keep_blocks(path: Path | None, fingerprint: str) -> Iterator[Checkpoint | No
         except OSError as error:
             raise unwritable(path, error) from None
         with file:
-            header_found = file.read(len(header))
-            if header_found and not header.startswith(header_found):
-                is_known = header_found.startswith(HEADER.encode())
+            stored_header = file.read(len(header))
+            if stored_header and not header.startswith(stored_header):
+                is_checkpoint = stored_header.startswith(HEADER.encode())
                 raise InputError(
                     f"--checkpoint {path}: "
                     + (
                         "has blocks of another map: other inputs or options; repeat these, remove "
                         "the file, or give another"
-                        if is_known
+                        if is_checkpoint
                         else "is a file of something else; give another name"
                     )
                 )
-            if header_found != header:
+            if stored_header != header:
                 file.seek(0)
                 file.write(header)
             yield Checkpoint(path, file)

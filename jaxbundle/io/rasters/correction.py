@@ -92,10 +92,10 @@ def map_of(
             if isinstance(surface, Terrain)
             else "no point of the image is on the ground; check attitude and mounting"
         )
-    covered = np.mean(np.isfinite(X).all(0))
-    if isinstance(surface, Terrain) and covered < 1:
+    covered_share = np.mean(np.isfinite(X).all(0))
+    if isinstance(surface, Terrain) and covered_share < 1:
         tell(
-            f"{model or 'terrain'}: no height for {100 * (1 - covered):.2g} % of the image "
+            f"{model or 'terrain'}: no height for {100 * (1 - covered_share):.2g} % of the image "
             f"({X[0].size} positions): the map has no data there, or ends; give a model that "
             "covers the image"
         )
@@ -173,7 +173,7 @@ def write_corrected(
         def block(nodes: MapNodes) -> np.ndarray | None:
             geometry = image, search, surface, nodes
             places = block_places(*geometry, correction.occlusion, correction.tolerance)
-            return None if places is None else pixels.at(image, places)
+            return None if places is None else pixels.values_at(image, places)
 
         format, checkpoint = stored
         write_map(target, system, grid, surface, pixels.bands, block, progress, format, checkpoint)
@@ -200,10 +200,10 @@ class _SourcePixels:
         flags = raster.mask_flag_enums
         values = set(raster.nodatavals)
         self._missing = next(iter(values)) if len(values) == 1 else None
-        is_nodata_only = all([flag.name for flag in band] == ["nodata"] for band in flags)
-        is_all_valid = all([flag.name for flag in band] == ["all_valid"] for band in flags)
-        self._masked = not (is_all_valid or (is_nodata_only and self._missing is not None))
-        if is_all_valid:
+        all_nodata = all([flag.name for flag in band] == ["nodata"] for band in flags)
+        all_valid = all([flag.name for flag in band] == ["all_valid"] for band in flags)
+        self._masked = not (all_valid or (all_nodata and self._missing is not None))
+        if all_valid:
             self._missing = None
         nodata = correction.nodata if correction.nodata is not None else self._missing
         if (
@@ -228,30 +228,30 @@ class _SourcePixels:
         )
         self._keeps_apart = nodata is not None and dtype.kind != "f"
 
-    def at(self, image: PushbroomImage | RpcImage, places: Places) -> np.ndarray | None:
+    def values_at(self, image: PushbroomImage | RpcImage, places: Places) -> np.ndarray | None:
         """The values [bands, rows, columns] of all bands at the positions of a block; None if
         no data."""
         line, pixel = map(np.asarray, places)
         dtype = np.dtype(self.bands.dtype)
-        values_found = np.full((*line.shape, self.bands.count), self.bands.missing, dtype)
+        block = np.full((*line.shape, self.bands.count), self.bands.nodata_value, dtype)
         # 2²² values of all bands are at most 32 MB in memory for each of the two workers
         max_pixels, reach = 2**22 / self.bands.count, REACH[self._kind]
         has_values = False
         for part, window in _parts(line, pixel, image, max_pixels, reach):
             pixels = self._read_window(window)
-            (top, _), (left, _) = window
-            values, any_ = _resample(
+            (first_line, _), (first_pixel, _) = window
+            values, part_has_values = _resample(
                 self._kind,
                 str(dtype),
                 self._keeps_apart,
                 pixels,
                 (np.nan if self._missing is None or self._masked else self._missing),
-                self.bands.missing,
-                (line[part] - top, pixel[part] - left),
+                self.bands.nodata_value,
+                (line[part] - first_line, pixel[part] - first_pixel),
             )
-            values_found[part] = values
-            has_values |= bool(any_)
-        return np.moveaxis(values_found, -1, 0) if has_values else None
+            block[part] = values
+            has_values |= bool(part_has_values)
+        return np.moveaxis(block, -1, 0) if has_values else None
 
     def _read_window(self, window: Window) -> np.ndarray:
         """The pixels [rows, columns, bands] of a window, NaN where they are masked.
@@ -274,34 +274,36 @@ def _resample(
     dtype: str,
     keeps_apart: bool,
     pixels: Num[AnyArray, "rows columns bands"],
-    source_missing: Scalar,
-    missing: Scalar,
-    place: tuple[Float[AnyArray, "*shape"], Float[AnyArray, "*shape"]],
+    source_nodata: Scalar,
+    nodata: Scalar,
+    positions: tuple[Float[AnyArray, "*shape"], Float[AnyArray, "*shape"]],
 ) -> tuple[Num[Array, "*shape bands"], Bool[Array, ""]]:
     """The stored values at positions, and whether there are any.
 
-    **Arguments:** `keeps_apart`: a value that is by chance that of no data, `missing`, is changed
-    by one; `source_missing`: the value of no data of the pixels, NaN for none.
+    **Arguments:** `keeps_apart`: a value that is by chance that of no data, `nodata`, is changed
+    by one; `source_nodata`: the value of no data of the pixels, NaN for none.
     """
     working = working_type(pixels.dtype)
-    lacking = pixels == jnp.asarray(source_missing).astype(pixels.dtype)
-    lacking &= ~jnp.isnan(source_missing)
-    has_gaps = jnp.any(lacking)
+    is_nodata = pixels == jnp.asarray(source_nodata).astype(pixels.dtype)
+    is_nodata &= ~jnp.isnan(source_nodata)
+    has_gaps = jnp.any(is_nodata)
     # A copy in floating point only where it is needed.
     values = jax.lax.cond(
         has_gaps,
-        lambda: resample_pixels(jnp.where(lacking, jnp.nan, pixels.astype(working)), *place, kind),
-        lambda: resample_pixels(pixels, *place, kind),
+        lambda: resample_pixels(
+            jnp.where(is_nodata, jnp.nan, pixels.astype(working)), *positions, kind
+        ),
+        lambda: resample_pixels(pixels, *positions, kind),
     )
-    is_known = ~jnp.isnan(values)
+    has_value = ~jnp.isnan(values)
     if np.dtype(dtype).kind == "f":
-        return jnp.where(is_known, values, missing).astype(dtype), jnp.any(is_known)
+        return jnp.where(has_value, values, nodata).astype(dtype), jnp.any(has_value)
     limits = np.iinfo(dtype)
     rounded = jnp.clip(jnp.round(values), float(limits.min), float(limits.max))
     if keeps_apart:
-        beside = jnp.where(missing < limits.max, missing + 1, missing - 1)
-        rounded = jnp.where(rounded == missing, beside, rounded)
-    return jnp.where(is_known, rounded, missing).astype(dtype), jnp.any(is_known)
+        neighbour_value = jnp.where(nodata < limits.max, nodata + 1, nodata - 1)
+        rounded = jnp.where(rounded == nodata, neighbour_value, rounded)
+    return jnp.where(has_value, rounded, nodata).astype(dtype), jnp.any(has_value)
 
 
 def _parts(
@@ -312,20 +314,19 @@ def _parts(
     reach: int,
     part: Part = (slice(0, BLOCK_SIZE), slice(0, BLOCK_SIZE)),
 ) -> Iterator[tuple[Part, Window]]:
-    """Quarters of a block, quartered again until each covers at most `max_pixels` pixels of the
-    image.
+    """Quarters of a block, quartered again until each covers at most `max_pixels` of the image.
 
     Each as slices of the block, with the required rows and columns of the image. Parts outside the
     image are left out.
     """
-    places_of_part = line[part], pixel[part]
-    if not np.isfinite(places_of_part[0]).any():
+    positions = line[part], pixel[part]
+    if not np.isfinite(positions[0]).any():
         return
     # One pixel more than the kernel reaches, for rounding.
     margin = reach + 1
     lines, pixels = (
         (max(int(np.nanmin(v)) - margin, 0), min(int(np.nanmax(v)) + margin + 1, size))
-        for v, size in zip(places_of_part, (image.lines, image.pixels))
+        for v, size in zip(positions, (image.lines, image.pixels))
     )
     window = lines, pixels
     side = part[0].stop - part[0].start

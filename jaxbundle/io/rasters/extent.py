@@ -57,7 +57,7 @@ def image_extent(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> E
     longitude, latitude, _ = (np.degrees(np.asarray(v)) for v in _geodetic(earth, tuple(X)))
     middle = longitude[0, places // 2, places // 2]
     longitude = longitude - 360 * np.round((longitude - middle) / 360)
-    return _around(longitude, latitude)
+    return _extent_around(longitude, latitude)
 
 
 def pole_in_image(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> str | None:
@@ -72,8 +72,8 @@ def pole_in_image(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> 
     border = np.concatenate([X[:, 0], X[:, 1:, -1], X[:, -1, -2::-1], X[:, -2::-1, 0]], axis=1)
     if not np.isfinite(border).all():
         return None
-    turn = np.diff(np.unwrap(np.arctan2(border[1], border[0]))).sum()
-    if abs(turn) < np.pi:
+    winding_angle = np.diff(np.unwrap(np.arctan2(border[1], border[0]))).sum()
+    if abs(winding_angle) < np.pi:
         return None
     return "North Pole" if border[2].mean() > 0 else "South Pole"
 
@@ -81,7 +81,7 @@ def pole_in_image(image: PushbroomImage, earth: Ellipsoid, places: int = 17) -> 
 def rpc_extent(rpc: Rpc) -> Extent | None:
     """The validity domain of coefficients."""
     ends = np.array([-REACH, REACH])
-    return _around(
+    return _extent_around(
         float(rpc.longitude_offset) + abs(float(rpc.longitude_scale)) * ends,
         float(rpc.latitude_offset) + abs(float(rpc.latitude_scale)) * ends,
     )
@@ -93,16 +93,24 @@ def joint_extent(extents: Sequence[Extent | None]) -> Extent | None:
     if len(known_extents) < len(extents) or not known_extents:
         return None
     # The turn that brings each nearest to the first.
-    turns = [360 * round((known_extents[0].west - extent.west) / 360) for extent in known_extents]
+    longitude_shifts = [
+        360 * round((known_extents[0].west - extent.west) / 360) for extent in known_extents
+    ]
     return Extent(
-        min(extent.west + turn for extent, turn in zip(known_extents, turns)),
+        min(
+            extent.west + longitude_shift
+            for extent, longitude_shift in zip(known_extents, longitude_shifts)
+        ),
         min(extent.south for extent in known_extents),
-        max(extent.east + turn for extent, turn in zip(known_extents, turns)),
+        max(
+            extent.east + longitude_shift
+            for extent, longitude_shift in zip(known_extents, longitude_shifts)
+        ),
         max(extent.north for extent in known_extents),
     )
 
 
-def _around(
+def _extent_around(
     longitude: Float[np.ndarray, "..."], latitude: Float[np.ndarray, "..."]
 ) -> Extent | None:
     """The extent of points with a margin; None at a pole, where all longitudes may be visible."""

@@ -58,38 +58,38 @@ def undulations_at(
     """N in metres at points, degrees; NaN outside the grid."""
     geoid = Path(geoid)
     if not geoid.exists():
-        return _in_parts(_grid_of_proj(geoid), longitude, latitude)
+        return _evaluate_in_portions(_grid_of_proj(geoid), longitude, latitude)
     extent = Extent(longitude.min(), latitude.min(), longitude.max(), latitude.max())
     grid = read_terrain(geoid, WGS84, extent)
     heights, (x0, y0), (dx, dy) = np.asarray(grid.heights), *np.degrees([grid.origin, grid.step])
     middle = x0 + dx * (heights.shape[1] - 1) / 2
     longitude = longitude - 360 * np.round((longitude - middle) / 360)
     function = lambda x, y: _bilinear(heights, (y - y0) / dy, (x - x0) / dx)
-    return _in_parts(function, longitude, latitude)
+    return _evaluate_in_portions(function, longitude, latitude)
 
 
-def _in_parts(
+def _evaluate_in_portions(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     longitude: Float[np.ndarray, "*#shape"],
     latitude: Float[np.ndarray, "*#shape"],
-    points_at_once: int = 1 << 18,
+    portion: int = 1 << 18,
 ) -> Float[np.ndarray, "*shape"]:
-    """A function of points, about as many `points_at_once`: interpolation has a dozen arrays of
+    """A function of points, about `portion` of them at a time: interpolation has a dozen arrays of
     their number, for 2¹⁸ points 25 MB."""
     shape = np.broadcast_shapes(longitude.shape, latitude.shape)
-    out = np.empty(shape)
-    if out.size <= points_at_once:
-        out[...] = function(longitude, latitude)
-        return out
-    rows = max(1, points_at_once // (out.size // shape[0]))
+    values = np.empty(shape)
+    if values.size <= portion:
+        values[...] = function(longitude, latitude)
+        return values
+    rows = max(1, portion // (values.size // shape[0]))
     for begin in range(0, shape[0], rows):
         part = slice(begin, begin + rows)
         # An axis of one stands for all rows.
         x, y = (
             a[part] if a.ndim == len(shape) and len(a) > 1 else a for a in (longitude, latitude)
         )
-        out[part] = function(x, y)
-    return out
+        values[part] = function(x, y)
+    return values
 
 
 def _bilinear(
@@ -99,12 +99,12 @@ def _bilinear(
 ) -> Float[np.ndarray, "*shape"]:
     """Values at rows and columns; NaN outside, or if a NaN has a weight."""
     edge = 1e-6  # cells: by rounding of degrees a point of the border may lie beyond it
-    clip_inside = lambda place, n: np.where(
-        (place >= -edge) & (place <= n - 1 + edge), np.clip(place, 0, n - 1), np.nan
+    clip_to_grid = lambda position, n: np.where(
+        (position >= -edge) & (position <= n - 1 + edge), np.clip(position, 0, n - 1), np.nan
     )
     (i, u), (k, v) = (
         (np.clip(np.nan_to_num(np.floor(p)).astype(int), 0, n - 2), p)
-        for p, n in zip(map(clip_inside, (row, column), values.shape), values.shape)
+        for p, n in zip(map(clip_to_grid, (row, column), values.shape), values.shape)
     )
     u, v = u - i, v - k
     # A NaN beside a point that lies on a line of the grid has the weight 0, but 0·NaN is NaN.

@@ -58,7 +58,7 @@ class MapBands:
         return {"photometric": "rgb" if rgb else "minisblack", "alpha": alpha}
 
     @property
-    def missing(self) -> float:
+    def nodata_value(self) -> float:
         """The value of no data."""
         if self.nodata is not None:
             return self.nodata
@@ -100,7 +100,7 @@ def write_map(
         if values.dtype != bands.dtype:
             if not np.isfinite(values).any():
                 return None
-            values = as_type(values, bands.dtype, bands.missing)
+            values = as_type(values, bands.dtype, bands.nodata_value)
         return values
 
     finish = None
@@ -114,7 +114,7 @@ def write_map(
         bands.dtype,
         finish,
         crs=system.text,
-        nodata=bands.missing,
+        nodata=bands.nodata_value,
         tiled=True,
         blockxsize=BLOCK_SIZE,
         blockysize=BLOCK_SIZE,
@@ -133,8 +133,12 @@ def write_map(
             min(BLOCK_SIZE, grid.rows - corner[0]),
             min(BLOCK_SIZE, grid.columns - corner[1]),
         )
-        take_kept = lambda k, corner: checkpoint and checkpoint.take(k, size(corner), bands.dtype)
-        for k, (corner, values, is_new) in enumerate(_in_order(corners, take_kept, compute)):
+        stored_block = lambda k, corner: (
+            checkpoint and checkpoint.take(k, size(corner), bands.dtype)
+        )
+        for k, (corner, values, is_new) in enumerate(
+            _ordered_blocks(corners, stored_block, compute)
+        ):
             if is_new and checkpoint is not None:
                 checkpoint.add(k, values)
             if values is not None and values.size:
@@ -143,28 +147,25 @@ def write_map(
                 progress("blocks", k + 1, len(corners))
 
 
-def _in_order(
+def _ordered_blocks(
     corners: Sequence[tuple[int, int]],
-    take_kept: Callable[[int, tuple[int, int]], np.ndarray | None],
+    stored_block: Callable[[int, tuple[int, int]], np.ndarray | None],
     compute: Callable[[tuple[int, int]], np.ndarray | None],
 ) -> Iterator[tuple[tuple[int, int], np.ndarray | None, bool]]:
     """The values of blocks in their order, kept ones or else computed by workers, and whether they
     were computed."""
-    number_kept = 0
-    while (
-        number_kept < len(corners)
-        and (values := take_kept(number_kept, corners[number_kept])) is not None
-    ):
-        yield corners[number_kept], values, False
-        number_kept += 1
-    corners_left = iter(corners[number_kept:])
+    number = 0
+    while number < len(corners) and (values := stored_block(number, corners[number])) is not None:
+        yield corners[number], values, False
+        number += 1
+    remaining_corners = iter(corners[number:])
     waiting: deque[tuple[tuple[int, int], Future]] = deque()
     with ThreadPoolExecutor(WORKERS) as workers:
         try:
             while True:
                 while (
                     len(waiting) < WORKERS + AHEAD
-                    and (corner := next(corners_left, None)) is not None
+                    and (corner := next(remaining_corners, None)) is not None
                 ):
                     waiting.append((corner, workers.submit(compute, corner)))
                 if not waiting:

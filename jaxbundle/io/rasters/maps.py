@@ -163,11 +163,11 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
 
     **Raises:** `InputError` if a projected system has its edge among the points.
     """
-    finite_rows = np.flatnonzero(np.isfinite(x))
-    if not len(finite_rows):
+    finite = np.flatnonzero(np.isfinite(x))
+    if not len(finite):
         return x
     # The one nearest to the middle of the lattice that has a place.
-    middle = x.ravel()[finite_rows[np.abs(finite_rows - x.size // 2).argmin()]]
+    middle = x.ravel()[finite[np.abs(finite - x.size // 2).argmin()]]
     x = system.unwrap(x, float(middle))
     if system.transformer and system.turn is None:
         steps = [np.abs(np.diff(x, axis=axis)).ravel() for axis in (0, 1)]
@@ -186,7 +186,7 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
 def grid_around(x: np.ndarray, y: np.ndarray, size: float, max_pixels: float = np.inf) -> MapGrid:
     """The pixels of this size that cover all points, with edges at multiples of it.
 
-    **Raises:** `InputError` for more than `max_pixels` pixels, or too many rows or columns for a
+    **Raises:** `InputError` for more than `max_pixels`, or too many rows or columns for a
     GeoTIFF."""
     left, right = np.floor(np.nanmin(x) / size), np.ceil(np.nanmax(x) / size)
     bottom, top = np.floor(np.nanmin(y) / size), np.ceil(np.nanmax(y) / size)

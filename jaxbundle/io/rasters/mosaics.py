@@ -35,27 +35,33 @@ def as_one_raster(path: str | Path) -> Iterator[Path]:
     tiles = sorted(p for p in path.iterdir() if p.suffix.lower() in TILES)
     if not tiles:
         raise InputError(f"{path}: no terrain tiles in this folder: {', '.join(TILES)}")
-    text = _virtual(tiles)
+    text = _virtual_raster(tiles)
     with temporary(tempfile.mkdtemp(prefix="jaxbundle-")) as folder:
         file = folder / "tiles.vrt"
         file.write_text(text, encoding="utf-8")
         yield file
 
 
-def _virtual(tiles: list[Path]) -> str:
+def _virtual_raster(tiles: list[Path]) -> str:
     """The XML of the virtual raster."""
     parts, bounds = [], []
     first_tile, crs, step = tiles[0], None, (0.0, 0.0)
     for tile in tiles:
         with open_raster(tile) as source:
             check_georeference(tile, source)
-            place = source.transform
+            transform = source.transform
             if tile is first_tile:
-                crs, step, origin = source.crs, (place.a, place.e), (place.c, place.f)
-            row_and_column = [(o - q) / s for o, q, s in zip((place.c, place.f), origin, step)]
-            _check_alike(tile, first_tile, source, (crs, step), row_and_column)
+                crs, step, origin = (
+                    source.crs,
+                    (transform.a, transform.e),
+                    (transform.c, transform.f),
+                )
+            lattice_offset = [
+                (o - q) / s for o, q, s in zip((transform.c, transform.f), origin, step)
+            ]
+            _check_lattice(tile, first_tile, source, (crs, step), lattice_offset)
             rows, columns = source.shape
-            left, top = round(row_and_column[0]), round(row_and_column[1])
+            left, top = round(lattice_offset[0]), round(lattice_offset[1])
             bounds.append((left, top, left + columns, top + rows))
             nodata = "" if source.nodata is None else f"<NODATA>{source.nodata!r}</NODATA>"
             scale, offset = source.scales[0], source.offsets[0]
@@ -85,24 +91,29 @@ def _virtual(tiles: list[Path]) -> str:
     )
 
 
-def _check_alike(
+def _check_lattice(
     tile: Path,
     first_tile: Path,
     source: "DatasetReader",
-    system_and_step: tuple[object, tuple[float, float]],
-    row_and_column: list[float],
+    lattice: tuple[object, tuple[float, float]],
+    lattice_offset: list[float],
 ) -> None:
     """Refuse a tile that is not on the lattice of the first."""
-    crs, step = system_and_step
-    place = source.transform
-    todo = "; make one raster of the tiles, such as with gdalwarp, and give that"
+    crs, step = lattice
+    transform = source.transform
+    remedy = "; make one raster of the tiles, such as with gdalwarp, and give that"
     if source.crs != crs:
-        raise InputError(f"{tile}: its coordinate system is not that of {first_tile.name}{todo}")
+        raise InputError(f"{tile}: its coordinate system is not that of {first_tile.name}{remedy}")
     # A hundredth of a pixel over the length of a tile.
     length = max(source.shape)
-    odd = max(abs(a / s - 1) * length for a, s in zip((place.a, place.e), step))
-    if place.b or place.d or odd > 0.01 or max(abs(v - round(v)) for v in row_and_column) > 0.01:
+    deviation = max(abs(a / s - 1) * length for a, s in zip((transform.a, transform.e), step))
+    if (
+        transform.b
+        or transform.d
+        or deviation > 0.01
+        or max(abs(v - round(v)) for v in lattice_offset) > 0.01
+    ):
         raise InputError(
-            f"{tile}: its pixels of {place.a:g} × {abs(place.e):g} are not on the lattice of "
-            f"{first_tile.name}, {step[0]:g} × {abs(step[1]):g}{todo}"
+            f"{tile}: its pixels of {transform.a:g} × {abs(transform.e):g} are not on the lattice "
+            f"of {first_tile.name}, {step[0]:g} × {abs(step[1]):g}{remedy}"
         )

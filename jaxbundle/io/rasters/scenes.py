@@ -56,7 +56,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> SceneRaster:
     return SceneRaster(bands, dtype, place)
 
 
-def write_taken(
+def write_scene_image(
     path: Path,
     image: PushbroomImage,
     surface: GroundSurface,
@@ -74,17 +74,17 @@ def write_taken(
 
     **Raises:** `InputError` if the scene is not in the image.
     """
-    has_pixels = False
+    has_values = False
     with write_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
         for begin in range(0, image.lines, portion):
             lines = np.arange(begin, begin + portion, dtype=float)
             # The last portion is as long as the others, so that it needs no program of its own.
-            lines_inside = np.minimum(lines, image.lines - 1)
-            values = take_image(image, surface, bands, place, lines_inside, resampling)
+            clipped_lines = np.minimum(lines, image.lines - 1)
+            values = take_image(image, surface, bands, place, clipped_lines, resampling)
             values = values[:, : image.lines - begin]
-            has_pixels |= bool(np.isfinite(values).any())
+            has_values |= bool(np.isfinite(values).any())
             target.write(as_type(values, dtype), begin)
             if progress:
                 progress("lines", begin + values.shape[1], image.lines)
-        if not has_pixels:
+        if not has_values:
             raise InputError("the image shows nothing of the scene: check track and coordinates")

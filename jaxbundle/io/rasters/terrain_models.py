@@ -54,7 +54,7 @@ def read_terrain(
         check_georeference(path, source)
         height = HeightScale(source.scales[0], source.offsets[0])
         if earth is None:
-            return _terrain(source, earth, path, extent, height)
+            return _read_terrain(source, earth, path, extent, height)
         if source.crs is None:
             raise InputError(
                 f"{path}: the raster has no coordinate system; add one, such as with "
@@ -62,7 +62,7 @@ def read_terrain(
             )
         height = with_vertical_unit(path, source.crs.to_wkt(), height, above_geoid)
         if source.crs.is_geographic:
-            return _terrain(source, earth, path, extent, height)
+            return _read_terrain(source, earth, path, extent, height)
         degrees = _degrees_around(path, source)
 
         def warp(kind: str) -> "WarpedVRT":
@@ -76,7 +76,7 @@ def read_terrain(
                 )
 
         with warp("bilinear") as warped, warp("nearest") as exact:
-            return _terrain(warped, earth, path, extent, height, exact)
+            return _read_terrain(warped, earth, path, extent, height, exact)
 
 
 def _degrees_around(path: str | Path, source: "DatasetReader") -> str:
@@ -94,7 +94,7 @@ def _degrees_around(path: str | Path, source: "DatasetReader") -> str:
     )
 
 
-def _terrain(
+def _read_terrain(
     source: "DatasetReader",
     earth: Ellipsoid | None,
     path: str | Path,
@@ -108,22 +108,24 @@ def _terrain(
     if transform.b or transform.d:
         raise InputError(f"{path}: the raster is rotated; make it north up with gdalwarp")
     step = transform.a, transform.e
-    read_cells = lambda source: (
+    read_heights = lambda source: (
         (_heights(path, source, None, height), (0, 0))
         if earth is None or extent is None
-        else _cut_extent(source, path, extent, height)
+        else _read_extent(source, path, extent, height)
     )
-    heights, first_cell = read_cells(source)
+    heights, first_cell = read_heights(source)
     if _has_strange_heights(heights):
-        _refuse_undeclared_no_data(path, heights if exact is None else read_cells(exact)[0], height)
+        _refuse_undeclared_no_data(
+            path, heights if exact is None else read_heights(exact)[0], height
+        )
     unit = 1.0 if earth is None else np.pi / 180
     x, y = (
         transform.c + (first_cell[1] + 0.5) * step[0],
         transform.f + (first_cell[0] + 0.5) * step[1],
     )
     if not np.isfinite(heights).any():
-        place_in_words = "" if extent is None else f" where the image looks, {extent}"
-        raise InputError(f"{path}: no height{place_in_words}; give a model that covers the image")
+        area = "" if extent is None else f" where the image looks, {extent}"
+        raise InputError(f"{path}: no height{area}; give a model that covers the image")
     with naming_file(path):
         return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
 
@@ -147,24 +149,23 @@ def _refuse_undeclared_no_data(
     **Arguments:** `gap`: metres to the next height. Deep sea and high mountains of other bodies
     have heights between.
     """
-    known_heights = heights[np.isfinite(heights)]
-    for end, sign in ((known_heights.min(), 1.0), (known_heights.max(), -1.0)):
-        other_heights = known_heights[known_heights != end]
+    finite_heights = heights[np.isfinite(heights)]
+    for end, sign in ((finite_heights.min(), 1.0), (finite_heights.max(), -1.0)):
+        other_heights = finite_heights[finite_heights != end]
         if not len(other_heights):
             return
         nearest = other_heights.min() if sign > 0 else other_heights.max()
         if sign * (nearest - end) > gap and _has_strange_heights(end[None, None]):
             mark = (end - height.offset) / height.scale
             raise InputError(
-                f"{path}: {len(known_heights) - len(other_heights)} of {len(known_heights)} cells "
-                "have the height "
-                f"{end:.10g}, the others {other_heights.min():.6g} to {other_heights.max():.6g}; "
-                "if it "
-                f"marks cells without height, declare it: gdal_edit.py -a_nodata {mark:.10g} FILE"
+                f"{path}: {len(finite_heights) - len(other_heights)} of {len(finite_heights)} "
+                f"cells have the height {end:.10g}, the others {other_heights.min():.6g} to "
+                f"{other_heights.max():.6g}; if it marks cells without height, declare it: "
+                f"gdal_edit.py -a_nodata {mark:.10g} FILE"
             )
 
 
-def _cut_extent(
+def _read_extent(
     source: "DatasetReader", path: str | Path, extent: Extent, height: HeightScale
 ) -> tuple[Float[np.ndarray, "rows columns"], tuple[int, int]]:
     """The heights of the extent and a cell around it, and the row and column of the first."""
@@ -173,27 +174,31 @@ def _cut_extent(
     bounds = source.bounds
     # Rows count from the north, or from the south.
     y = np.sort([(v - y0) / dy for v in (extent.south, extent.north)])
-    top, bottom = max(int(np.floor(y[0])) - 2, 0), min(int(np.ceil(y[1])) + 2, rows)
-    turn = 360 / abs(dx)
+    first_row, end_row = max(int(np.floor(y[0])) - 2, 0), min(int(np.ceil(y[1])) + 2, rows)
+    columns_per_turn = 360 / abs(dx)
     # The turn that brings the extent nearest to the raster.
     middle = ((extent.west + extent.east) / 2 - x0) / dx
-    shift = turn * np.round((columns / 2 - middle) / turn)
+    shift = columns_per_turn * np.round((columns / 2 - middle) / columns_per_turn)
     x = np.sort([(v - x0) / dx + shift for v in (extent.west, extent.east)])
-    left, right = int(np.floor(x[0])) - 2, int(np.ceil(x[1])) + 2
+    first_column, end_column = int(np.floor(x[0])) - 2, int(np.ceil(x[1])) + 2
     # 1e-3 columns: the spacing in the file has some ten digits
-    seam = abs(turn - columns) < 1e-3 and (left < 0 or right > columns)
-    if not (seam and right - left < columns):
-        seam, left, right = False, max(left, 0), min(right, columns)
-    if min(right - left, bottom - top) < 2:
-        covered = Extent(bounds.left, min(bounds[1::2]), bounds.right, max(bounds[1::2]))
+    seam = abs(columns_per_turn - columns) < 1e-3 and (first_column < 0 or end_column > columns)
+    if not (seam and end_column - first_column < columns):
+        seam, first_column, end_column = False, max(first_column, 0), min(end_column, columns)
+    if min(end_column - first_column, end_row - first_row) < 2:
+        model_extent = Extent(bounds.left, min(bounds[1::2]), bounds.right, max(bounds[1::2]))
         raise InputError(
-            f"{path}: the model has {covered}; the image looks at {extent}: give a model that "
+            f"{path}: the model has {model_extent}; the image looks at {extent}: give a model that "
             "covers the image"
         )
     # The last column of a model of the whole Earth is beside its first.
-    parts = [(left % columns, columns), (0, right % columns)] if seam else [(left, right)]
-    heights = [_heights(path, source, ((top, bottom), part), height) for part in parts]
-    return np.concatenate(heights, axis=1), (top, left)
+    parts = (
+        [(first_column % columns, columns), (0, end_column % columns)]
+        if seam
+        else [(first_column, end_column)]
+    )
+    heights = [_heights(path, source, ((first_row, end_row), part), height) for part in parts]
+    return np.concatenate(heights, axis=1), (first_row, first_column)
 
 
 def _heights(

@@ -55,7 +55,7 @@ def with_vertical_unit(
             f"{path}: its heights are those of {vertical.name!r}, not above the ellipsoid; give "
             f"the geoid: --geoid {grid} (a grid of PROJ: projsync --file {grid}), or, if they are "
             "above the ellipsoid nevertheless, a copy without the vertical system (gdal_translate "
-            f"-a_srs {_horizontal(system)})"
+            f"-a_srs {_horizontal_system(system)})"
         )
     if vertical is None and above_geoid:
         raise InputError(
@@ -66,7 +66,7 @@ def with_vertical_unit(
     return HeightScale(factor * height.scale, factor * height.offset)
 
 
-def _horizontal(system: Any) -> str:
+def _horizontal_system(system: Any) -> str:
     parts = [part for part in system.sub_crs_list if not part.is_vertical]
     code = parts[0].to_epsg() if parts else None
     return f"EPSG:{code or 4326}"
@@ -137,10 +137,10 @@ def with_heights_above(horizontal: str, geoid: str | Path) -> str:
     code = next((code for code, grid in GRIDS.items() if grid == name), None)
     map_system = pyproj.CRS.from_user_input(horizontal)
     if code is not None:
-        short = map_system.to_authority(min_confidence=100)
+        authority = map_system.to_authority(min_confidence=100)
         vertical = pyproj.CRS.from_epsg(code)
-        if short is not None:
-            return f"{':'.join(short)}+{code}"
+        if authority is not None:
+            return f"{':'.join(authority)}+{code}"
     else:
         quoted = name.replace('"', '""')
         vertical = pyproj.CRS.from_wkt(

@@ -34,9 +34,12 @@ class RasterWriter:
         self.sums: dict[tuple, int] = {}
         """The checksum of every block, by its window."""
 
-    def write(self, values: np.ndarray, top: int = 0, left: int = 0) -> None:
+    def write(self, values: np.ndarray, first_row: int = 0, first_column: int = 0) -> None:
         """Write values [band, row, column] from a row and a column on."""
-        window = (top, top + values.shape[1]), (left, left + values.shape[2])
+        window = (
+            (first_row, first_row + values.shape[1]),
+            (first_column, first_column + values.shape[2]),
+        )
         with self._lock, _silence:
             self._raster.write(values, window=window)
         self.sums[window] = _checksum(values)
@@ -93,29 +96,27 @@ def write_raster(
             finally:
                 with _silence:
                     raster.close()
-            is_whole = _is_whole(name, writer.sums)
-            if is_whole and finish is not None:
+            is_complete = _is_complete(name, writer.sums)
+            if is_complete and finish is not None:
                 with _silence:
                     finish(name)
-                is_whole = _is_whole(name, writer.sums)
+                is_complete = _is_complete(name, writer.sums)
         except package.errors.RasterioError as error:
-            why = error.__cause__ or error
-            raise _unwritable(target, " ".join(str(why).split()).rstrip(".")) from None
-        if not is_whole:
+            reason = error.__cause__ or error
+            raise _unwritable(target, " ".join(str(reason).split()).rstrip(".")) from None
+        if not is_complete:
             raise _unwritable(target, "the written data are not on the disk")
 
 
-def add_overviews(
-    path: Path, size: tuple[int, int], nearest: bool, smallest_side: int = 256
-) -> None:
+def add_overviews(path: Path, size: tuple[int, int], nearest: bool, min_size: int = 256) -> None:
     """Add overviews to a GeoTIFF: half the size, a quarter and so on, each pixel the mean of those
     with data that it covers, or one of them (`nearest`).
 
-    **Arguments:** `smallest_side`: rows and columns down to which the overviews go, those of a
-    tile."""
+    **Arguments:** `min_size`: rows and columns down to which the overviews go, those of a tile.
+    """
     package = rasterio()
     factors = []
-    while max(size) > smallest_side * 2 ** len(factors):
+    while max(size) > min_size * 2 ** len(factors):
         factors.append(2 ** (len(factors) + 1))
     if not factors:
         return
@@ -128,12 +129,12 @@ def make_cog(path: Path, compress: str, block: int, nearest: bool) -> None:
     """Replace a GeoTIFF with its overviews by a Cloud Optimized GeoTIFF of the same values."""
     import rasterio.shutil
 
-    temporary_file = path.with_name(f"{path.stem}.cog{path.suffix}")
-    with temporary(temporary_file):
+    cog_path = path.with_name(f"{path.stem}.cog{path.suffix}")
+    with temporary(cog_path):
         options = {"compress": compress, "predictor": "yes"} if compress != "none" else {}
         rasterio.shutil.copy(
             path,
-            temporary_file,
+            cog_path,
             driver="COG",
             BLOCKSIZE=block,
             OVERVIEWS="AUTO",
@@ -141,17 +142,17 @@ def make_cog(path: Path, compress: str, block: int, nearest: bool) -> None:
             BIGTIFF="IF_SAFER",
             **options,
         )
-        os.replace(temporary_file, path)
+        os.replace(cog_path, path)
 
 
-def _is_whole(path: Path, sums: Mapping[tuple, int]) -> bool:
+def _is_complete(path: Path, sums: Mapping[tuple, int]) -> bool:
     """Whether a file has the values that were written, by the checksum of every block."""
     with _silence, open_plain(path) as raster:
         return all(_checksum(raster.read(window=window)) == sum for window, sum in sums.items())
 
 
-def _unwritable(target: str | Path, why: str) -> InputError:
-    return InputError(f"{target}: cannot be written: {why}{disk_of(target)}")
+def _unwritable(target: str | Path, reason: str) -> InputError:
+    return InputError(f"{target}: cannot be written: {reason}{disk_of(target)}")
 
 
 def _checksum(values: np.ndarray) -> int:
@@ -173,10 +174,10 @@ class _Silence:
         with self._lock:
             self._blocks += 1
             if self._blocks == 1:
-                with suppress(OSError), open(os.devnull, "wb") as nowhere:
+                with suppress(OSError), open(os.devnull, "wb") as null_device:
                     # Libtiff writes to the descriptor itself, past Python's sys.stderr.
                     self._kept = os.dup(2)
-                    os.dup2(nowhere.fileno(), 2)
+                    os.dup2(null_device.fileno(), 2)
 
     def __exit__(self, *_: object) -> None:
         with self._lock:

@@ -19,9 +19,9 @@ def budget_dict(budget: "Budget") -> dict[str, Any]:
             result["total"] = effect
         else:
             result["held"][cause] = {"effect": effect, "share": share}
-    held_inputs = {}
+    held_causes = {}
     for cause in budget.causes:
         unit = budget.angle_scale if cause.angle else 1.0
         sigma = None if cause.sigma is None else cause.sigma * unit
-        held_inputs[cause.name] = {"sigma": sigma, "errors": len(cause.errors)}
-    return {"held": held_inputs, "results": results}
+        held_causes[cause.name] = {"sigma": sigma, "errors": len(cause.errors)}
+    return {"held": held_causes, "results": results}

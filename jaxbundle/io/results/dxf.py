@@ -43,14 +43,14 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
         drawing.layers.add(layer, color=COLOURS["camera" if layer[0] == "C" else "tie"])
     space = drawing.modelspace()
     points = network.points
-    is_known = np.isfinite(points.position).all(1)
+    has_coordinates = np.isfinite(points.position).all(1)
     corners, _ = pyramids(network)
-    everything = np.concatenate([points.position[is_known], corners.reshape(-1, 3)])
-    height = 0.01 * float(np.ptp(everything, axis=0).max())  # of names, legible on a full page
-    for row in np.flatnonzero(is_known):
-        place = tuple(points.position[row].tolist())
-        space.add_point(place, dxfattribs={"layer": f"POINTS_{points.role[row].upper()}"})
-        _write_name(space, points.id[row], place, height, "POINT_NAMES")
+    all_positions = np.concatenate([points.position[has_coordinates], corners.reshape(-1, 3)])
+    height = 0.01 * float(np.ptp(all_positions, axis=0).max())  # of names, legible on a full page
+    for row in np.flatnonzero(has_coordinates):
+        position = tuple(points.position[row].tolist())
+        space.add_point(position, dxfattribs={"layer": f"POINTS_{points.role[row].upper()}"})
+        _write_name(space, points.id[row], position, height, "POINT_NAMES")
     for id, pyramid in zip(network.images.id, corners.tolist()):
         centre, *base = map(tuple, pyramid)
         for a, b in [*((centre, c) for c in base), *zip(base, [*base[1:], base[0]])]:
@@ -74,8 +74,8 @@ DXF_LOSSES = losing(
 
 
 def _write_name(
-    space: "Modelspace", name: str, place: tuple[float, ...], height: float, layer: str
+    space: "Modelspace", name: str, position: tuple[float, ...], height: float, layer: str
 ) -> None:
     # Control characters would break the lines of the file.
     safe = "".join(c if c.isprintable() else "_" for c in name)
-    space.add_text(safe, height=height, dxfattribs={"layer": layer, "insert": place})
+    space.add_text(safe, height=height, dxfattribs={"layer": layer, "insert": position})

@@ -48,7 +48,7 @@ class Feature(NamedTuple):
     """A feature: its layer, a point [3] or the ring of a polygon [n, 2], attributes."""
 
     layer: str
-    place: Float[np.ndarray, "..."]
+    coordinates: Float[np.ndarray, "..."]
     attributes: dict[str, Any]
 
 
@@ -66,16 +66,16 @@ def write_geojson(
     transform = require_transformation(crs)
     features = []
     for feature in collect_features(result, factor):
-        place = np.atleast_2d(feature.place)
-        lonlat = np.column_stack(transform(place[:, 0], place[:, 1]))
+        coordinates = np.atleast_2d(feature.coordinates)
+        lonlat = np.column_stack(transform(coordinates[:, 0], coordinates[:, 1]))
         if not np.isfinite(lonlat).all() or not (np.abs(lonlat) <= [180.0, 90.0]).all():
             raise InputError(f"{crs}: the coordinates are outside of this system")
         features.append(
             {
                 "type": "Feature",
                 "id": f"{feature.layer}/{feature.attributes['id']}",
-                "geometry": _geometry(lonlat, place, feature.layer),
-                "properties": {"layer": feature.layer, **_plain(feature.attributes)},
+                "geometry": _geometry(lonlat, coordinates, feature.layer),
+                "properties": {"layer": feature.layer, **_json_attributes(feature.attributes)},
             }
         )
     document = {"type": "FeatureCollection", "features": features}
@@ -83,12 +83,12 @@ def write_geojson(
 
 
 def _geometry(
-    lonlat: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "n d"], layer: str
+    lonlat: Float[np.ndarray, "n 2"], coordinates: Float[np.ndarray, "n d"], layer: str
 ) -> dict[str, Any]:
     # Nine digits: a tenth of a millimetre.
     rounded = np.round(lonlat, 9).tolist()
     if layer != "ellipses":
-        return {"type": "Point", "coordinates": [*rounded[0], float(place[0, 2])]}
+        return {"type": "Point", "coordinates": [*rounded[0], float(coordinates[0, 2])]}
     # RFC 7946, 3.1.6: closed, the exterior ring counterclockwise
     ring = rounded if _is_counterclockwise(lonlat) else rounded[::-1]
     return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
@@ -116,7 +116,7 @@ def write_geopackage(
     with replace_file(path) as temporary:
         try:
             with closing(sqlite3.connect(temporary)) as database, database:
-                _fill(database, features, system)
+                _fill_database(database, features, system)
         except sqlite3.Error as error:
             raise InputError(f"{path}: cannot be written: {error}") from None
 
@@ -162,17 +162,17 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
     if (modelled := result.correlated_point_covariance) is not None:
         size = lambda C: np.trace(C, axis1=1, axis2=2)[:, None, None]
         C = np.where(size(modelled) > size(C), modelled, C)
-    place = result.point_values
-    is_known = np.asarray(np.isfinite(place).all(1))
-    for row in np.flatnonzero(is_known):
+    coordinates = result.point_values
+    has_coordinates = np.asarray(np.isfinite(coordinates).all(1))
+    for row in np.flatnonzero(has_coordinates):
         sigma = np.sqrt(np.clip(np.diagonal(C[row]), 0, None))
         yield Feature(
             "points",
-            place[row],
+            coordinates[row],
             {
                 "id": str(points["id"][row]),
                 "role": str(points["role"][row]),
-                **dict(zip("XYZ", place[row].tolist())),
+                **dict(zip("XYZ", coordinates[row].tolist())),
                 **dict(zip(("sX", "sY", "sZ"), sigma.tolist())),
                 "rays": int(points["rays"][row]),
             },
@@ -190,30 +190,32 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
             },
         )
     ids = [str(id) for id in points["id"]]
-    yield from _ellipses(place, C, is_known, ids, factor)
+    yield from _ellipses(coordinates, C, has_coordinates, ids, factor)
 
 
 def _ellipses(
-    place: Float[np.ndarray, "n 3"],
+    coordinates: Float[np.ndarray, "n 3"],
     C: Float[np.ndarray, "n 3 3"],
-    is_known: np.ndarray,
+    has_coordinates: np.ndarray,
     ids: Sequence[str],
     factor: float | None,
 ) -> Iterator[Feature]:
-    rows = [r for r in np.flatnonzero(is_known) if np.isfinite(C[r]).all() and C[r, 0, 0] > 0]
+    rows = [
+        r for r in np.flatnonzero(has_coordinates) if np.isfinite(C[r]).all() and C[r, 0, 0] > 0
+    ]
     if not rows:
         return
     w, E = np.linalg.eigh(C[rows][:, :2, :2])
     axes = np.sqrt(np.clip(w, 0, None))
     if factor is None:
-        extent = float(np.ptp(place[is_known][:, :2], axis=0).max()) or 1.0
+        extent = float(np.ptp(coordinates[has_coordinates][:, :2], axis=0).max()) or 1.0
         factor = round_down(0.02 * extent / float(axes.max()))
     factor = positive("factor", factor)
-    turn = 2 * np.pi * np.arange(CORNERS) / CORNERS
-    circle = np.stack([np.cos(turn), np.sin(turn)])
+    angle = 2 * np.pi * np.arange(CORNERS) / CORNERS
+    circle = np.stack([np.cos(angle), np.sin(angle)])
     for row, axis, vectors in zip(rows, axes, E):
-        ring = place[row, :2] + factor * ((vectors * axis) @ circle).T
-        long = vectors[:, 1]
+        ring = coordinates[row, :2] + factor * ((vectors * axis) @ circle).T
+        major_axis = vectors[:, 1]
         yield Feature(
             "ellipses",
             ring,
@@ -222,7 +224,7 @@ def _ellipses(
                 "of": "point",
                 "a": float(axis[1]),
                 "b": float(axis[0]),
-                "bearing": math.degrees(math.atan2(long[0], long[1])) % 180.0,
+                "bearing": math.degrees(math.atan2(major_axis[0], major_axis[1])) % 180.0,
                 "factor": factor,
             },
         )
@@ -234,7 +236,7 @@ def round_down(x: float) -> float:
     return float(max(step for step in (1, 2, 5) if step * power <= x * (1 + 1e-9)) * power)
 
 
-def _plain(attributes: dict[str, Any]) -> dict[str, Any]:
+def _json_attributes(attributes: dict[str, Any]) -> dict[str, Any]:
     """Attributes without what JSON does not have."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -278,21 +280,23 @@ SYSTEMS = (
 )
 
 
-def _fill(database: sqlite3.Connection, features: list[Feature], system: int | None) -> None:
+def _fill_database(
+    database: sqlite3.Connection, features: list[Feature], system: int | None
+) -> None:
     database.execute(f"PRAGMA application_id = {APPLICATION}")
     database.execute(f"PRAGMA user_version = {VERSION}")
     for statement in TABLES.split(";"):
         database.execute(statement)
-    add = "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)"
-    database.executemany(add, SYSTEMS)
+    insert = "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)"
+    database.executemany(insert, SYSTEMS)
     srs = UNDEFINED if system is None else system
     if system is not None and system != 4326:  # noqa: PLR2004 - WGS 84 is there already
         name, definition = _definition(system)
-        database.execute(add, (name, system, "EPSG", system, definition, name))
+        database.execute(insert, (name, system, "EPSG", system, definition, name))
     for layer in LAYERS:
-        features_of_layer = [feature for feature in features if feature.layer == layer]
-        if features_of_layer:
-            _add_layer(database, layer, features_of_layer, srs)
+        layer_features = [feature for feature in features if feature.layer == layer]
+        if layer_features:
+            _add_layer(database, layer, layer_features, srs)
 
 
 def _definition(system: int) -> tuple[str, str]:
@@ -303,8 +307,8 @@ def _definition(system: int) -> tuple[str, str]:
     except ImportError:
         return f"EPSG:{system}", "undefined"
     try:
-        system_found = pyproj.CRS.from_epsg(system)
-        return system_found.name, system_found.to_wkt("WKT1_GDAL")
+        crs = pyproj.CRS.from_epsg(system)
+        return crs.name, crs.to_wkt("WKT1_GDAL")
     except CRSError as error:
         raise InputError(f"crs EPSG:{system}: {' '.join(str(error).split())}") from None
 
@@ -321,7 +325,7 @@ def _add_layer(database: sqlite3.Connection, layer: str, features: list[Feature]
         f'CREATE TABLE "{layer}" (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind}, '
         f"{columns})"
     )
-    corners = np.concatenate([np.atleast_2d(feature.place)[:, :2] for feature in features])
+    corners = np.concatenate([np.atleast_2d(feature.coordinates)[:, :2] for feature in features])
     low, high = corners.min(0).tolist(), corners.max(0).tolist()
     database.execute(
         "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, max_x, max_y, "
@@ -332,18 +336,25 @@ def _add_layer(database: sqlite3.Connection, layer: str, features: list[Feature]
         "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, ?, 0)", (layer, kind, srs, z)
     )
     marks = ", ".join("?" * (len(names) + 1))
-    listed = ", ".join(f'"{name}"' for name in names)
+    column_names = ", ".join(f'"{name}"' for name in names)
     database.executemany(
-        f'INSERT INTO "{layer}" (geom, {listed}) VALUES ({marks})',
-        [(_blob(feature, srs), *_plain(feature.attributes).values()) for feature in features],
+        f'INSERT INTO "{layer}" (geom, {column_names}) VALUES ({marks})',
+        [
+            (_geometry_blob(feature, srs), *_json_attributes(feature.attributes).values())
+            for feature in features
+        ],
     )
 
 
-def _blob(feature: Feature, srs: int) -> bytes:
+def _geometry_blob(feature: Feature, srs: int) -> bytes:
     """A geometry: the header of a GeoPackage (little-endian, no envelope), and ISO WKB."""
     header = b"GP" + struct.pack("<BBi", 0, 1, srs)
     if feature.layer != "ellipses":
-        return header + struct.pack("<BI3d", 1, 1001, *feature.place.tolist())
-    ring = feature.place if _is_counterclockwise(feature.place) else feature.place[::-1]
+        return header + struct.pack("<BI3d", 1, 1001, *feature.coordinates.tolist())
+    ring = (
+        feature.coordinates
+        if _is_counterclockwise(feature.coordinates)
+        else feature.coordinates[::-1]
+    )
     ring = np.concatenate([ring, ring[:1]])
     return header + struct.pack("<BIII", 1, 3, 1, len(ring)) + ring.astype("<f8").tobytes()

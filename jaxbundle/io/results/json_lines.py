@@ -36,25 +36,25 @@ class JsonLines:
         self._file = Path(os.path.realpath(path)) if regular else self.path
         self.heads: dict[str, dict[str, Any]] = {}
         self._shared: dict[str, object] = {}
-        end, has_repeated, is_whole = 0, False, True
+        end, has_repeated_keys, is_complete = 0, False, True
         for number, line in enumerate(self._lines() if regular else (), 1):
-            row, is_whole = _row(line), line.endswith(b"\n")
+            row, is_complete = _row(line), line.endswith(b"\n")
             if row is None:
                 # Zero bytes: what a crash of the system may leave at the end of a file.
-                if not is_whole and _is_torn(line.rstrip(b"\0")):
+                if not is_complete and _is_torn(line.rstrip(b"\0")):
                     break
                 raise InputError(
                     f"{self.path}, line {number}: not a result of jaxbundle batch; "
                     "give another file to --json-lines"
                 )
             end += len(line)
-            has_repeated |= row["key"] in self.heads
+            has_repeated_keys |= row["key"] in self.heads
             self.heads.setdefault(row["key"], self._head(row))
         self._write(lambda _: None)  # refuses a file that cannot be written before any work
-        if regular and not is_whole:
+        if regular and not is_complete:
             self._mend(end)
-        if has_repeated:
-            self._keep(self.heads)
+        if has_repeated_keys:
+            self._rewrite(self.heads)
 
     def __contains__(self, key: str) -> bool:
         return key in self.heads
@@ -69,26 +69,28 @@ class JsonLines:
 
     def rows(self, keys: Iterable[str]) -> Iterator[dict[str, Any]]:
         """The rows of some keys, in the order of the file."""
-        wanted_keys = set(keys)
+        requested_keys = set(keys)
         return (
-            row for row in map(_row, self._lines()) if row is not None and row["key"] in wanted_keys
+            row
+            for row in map(_row, self._lines())
+            if row is not None and row["key"] in requested_keys
         )
 
     def drop(self, keys: Iterable[str]) -> None:
         """Remove the lines of some keys."""
-        dropped = set(keys)
-        self.heads = {key: head for key, head in self.heads.items() if key not in dropped}
-        self._keep(self.heads)
+        dropped_keys = set(keys)
+        self.heads = {key: head for key, head in self.heads.items() if key not in dropped_keys}
+        self._rewrite(self.heads)
 
-    def _keep(self, keys: Iterable[str]) -> None:
+    def _rewrite(self, keys: Iterable[str]) -> None:
         """Rewrite the file with only the first line of each of these keys."""
-        keys_left, kept_lines = set(keys), []
+        remaining_keys, first_lines = set(keys), []
         for line in self._lines():
             row = _row(line)
-            if row is not None and row["key"] in keys_left:
-                keys_left.discard(row["key"])
-                kept_lines.append(line)
-        write_bytes(self._file, kept_lines)
+            if row is not None and row["key"] in remaining_keys:
+                remaining_keys.discard(row["key"])
+                first_lines.append(line)
+        write_bytes(self._file, first_lines)
 
     def _lines(self) -> Iterator[bytes]:
         try:
@@ -101,10 +103,10 @@ class JsonLines:
 
     def _write(self, write: Callable[[BinaryIO], object]) -> None:
         # A pipe may be slow: nothing waits for it.
-        without_interrupts = defer_interrupts() if self._regular else nullcontext()
-        size_before = self._file.stat().st_size if self._regular and self._file.exists() else 0
+        uninterrupted = defer_interrupts() if self._regular else nullcontext()
+        initial_size = self._file.stat().st_size if self._regular and self._file.exists() else 0
         try:
-            with without_interrupts, self._file.open("ab") as file:
+            with uninterrupted, self._file.open("ab") as file:
                 write(file)
                 file.flush()
                 if self._regular:
@@ -112,7 +114,7 @@ class JsonLines:
         except OSError as error:
             if self._regular:
                 with suppress(OSError):  # of a full disk: no part of a line stays
-                    os.truncate(self._file, size_before)
+                    os.truncate(self._file, initial_size)
             raise unwritable(self.path, error) from None
 
     def _head(self, row: dict[str, Any]) -> dict[str, Any]:

@@ -38,30 +38,29 @@ def write_ply(
     **Returns:** messages about what is lost.
     """
     need_values(network, points=False)
-    is_known = np.all(np.isfinite(network.points.position), axis=1)
+    has_coordinates = np.all(np.isfinite(network.points.position), axis=1)
     corners, edges = pyramids(network)
-    vertices = np.zeros(is_known.sum() + 5 * len(corners), VERTEX)
-    number_of_points = int(is_known.sum())
-    vertices["position"][:number_of_points] = network.points.position[is_known]
+    vertices = np.zeros(has_coordinates.sum() + 5 * len(corners), VERTEX)
+    point_count = int(has_coordinates.sum())
+    vertices["position"][:point_count] = network.points.position[has_coordinates]
     errors, unit = point_errors(network)
-    vertices["error"][:number_of_points], vertices["error"][number_of_points:] = (
-        errors[is_known],
+    vertices["error"][:point_count], vertices["error"][point_count:] = (
+        errors[has_coordinates],
         np.nan,
     )
-    vertices["position"][number_of_points:] = corners.reshape(-1, 3)
+    vertices["position"][point_count:] = corners.reshape(-1, 3)
     rgb = network.points.colour
     if rgb is None:
         rgb = np.array([COLOURS[role] for role in network.points.role], np.uint8).reshape(-1, 3)
     if colours:
-        own_colours = [colours.get(id, given) for id, given in zip(network.points.id, rgb.tolist())]
-        rgb = np.array(own_colours, np.uint8)
-    vertices["colour"][:number_of_points] = rgb[is_known]
-    vertices["colour"][number_of_points:] = (
-        220,
-        40,
-        40,
-    )  # red: cameras, against the blues of points
-    edges = (edges.reshape(-1, 2) + number_of_points).astype("<i4")
+        point_colours = [
+            colours.get(id, network_colour)
+            for id, network_colour in zip(network.points.id, rgb.tolist())
+        ]
+        rgb = np.array(point_colours, np.uint8)
+    vertices["colour"][:point_count] = rgb[has_coordinates]
+    vertices["colour"][point_count:] = (220, 40, 40)  # red: cameras, against the blues of points
+    edges = (edges.reshape(-1, 2) + point_count).astype("<i4")
     head = [
         "ply",
         "format binary_little_endian 1.0",

@@ -68,8 +68,8 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     head |= {"robust_scale": adjustment.robust_scale, "global_test": adjustment.global_test()}
     head |= {
         "cameras": {
-            given.id: _camera(adjustment.cameras[given.id], given)
-            for given in adjustment.problem.network.cameras
+            network_camera.id: _camera(adjustment.cameras[network_camera.id], network_camera)
+            for network_camera in adjustment.problem.network.cameras
         },
         "images": _images(adjustment),
         "further_unknowns": adjustment.further_unknowns,
@@ -84,9 +84,9 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
         ],
     }
     head |= {"second_minima": [_second_minimum(adjustment, s) for s in adjustment.second_minima]}
-    head |= {"check_points": _checks(adjustment)}
+    head |= {"check_points": _check_points(adjustment)}
     if adjustment.control_prediction is not None:
-        head |= {"control_prediction": _predicted(adjustment)}
+        head |= {"control_prediction": _control_prediction(adjustment)}
     if adjustment.error_model is not None:
         sizes, unit = adjustment.error_model.sizes, adjustment.image_unit
         head |= {"error_components": [size.to_dict(unit) for size in sizes]}
@@ -97,7 +97,7 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
         return head
     return head | {
         "verdict": verdict_dict(adjustment.verdict),
-        "variance_components": _components(adjustment),
+        "variance_components": _variance_components(adjustment),
         "points": dict(_points(adjustment.points)),
         "residuals": list(_residuals(adjustment.residuals)),
     }
@@ -113,20 +113,24 @@ def result_text(
     adjustment: "Adjustment", brief: bool = False, further_entries: Mapping = MappingProxyType({})
 ) -> Iterator[str]:
     """The result as JSON text, one line that ends with a line feed, in pieces: 2 000 000
-    image points take 1 GB. `further_entries`: further entries."""
+    image points take 1 GB. `further_entries`: beside those of `result_dict`."""
     # Without the long tables, which would need their memory at once.
     head = result_dict(adjustment, brief=True) | dict(further_entries)
     if brief or not adjustment.converged:
         yield _text(head) + "\n"
         return
-    further = {"verdict": verdict_dict(adjustment.verdict)}
-    further |= {"variance_components": _components(adjustment)}
+    summary = {"verdict": verdict_dict(adjustment.verdict)}
+    summary |= {"variance_components": _variance_components(adjustment)}
     # The two long tables are written in portions between the braces of the rest.
-    yield _text({**further, **head})[:-1]
+    yield _text({**summary, **head})[:-1]
     yield ', "points": {'
-    yield from _join(_text(dict(some))[1:-1] for some in take_portions(_points(adjustment.points)))
+    yield from _join(
+        _text(dict(portion))[1:-1] for portion in take_portions(_points(adjustment.points))
+    )
     yield '}, "residuals": ['
-    yield from _join(_text(some)[1:-1] for some in take_portions(_residuals(adjustment.residuals)))
+    yield from _join(
+        _text(portion)[1:-1] for portion in take_portions(_residuals(adjustment.residuals))
+    )
     yield "]}\n"
 
 
@@ -166,9 +170,10 @@ def verdict_dict(verdict: "Verdict") -> dict:
 
 
 def _camera(table: dict, camera: "Camera") -> dict:
-    free = table["free"]
+    free_names = table["free"]
     by_name = lambda C: {
-        a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
+        a: {b: float(C[i, j]) for j, b in enumerate(free_names) if j != i}
+        for i, a in enumerate(free_names)
     }
     return {
         "model": table["model"],
@@ -200,7 +205,7 @@ def _images(adjustment: "Adjustment") -> dict:
     }
 
 
-def _components(adjustment: "Adjustment") -> dict:
+def _variance_components(adjustment: "Adjustment") -> dict:
     return {
         name: {
             "observations": c.observations,
@@ -228,30 +233,30 @@ def _points(table: Mapping[str, np.ndarray]) -> Iterator[tuple[str, dict]]:
         )
 
 
-def _second_minimum(adjustment: "Adjustment", second_minimum: "SecondMinimum") -> dict:
+def _second_minimum(adjustment: "Adjustment", minimum: "SecondMinimum") -> dict:
     return {
-        "ambiguity": second_minimum.ambiguity,
-        "images": list(second_minimum.images),
-        "vtpv": second_minimum.vtpv,
-        "other_vtpv": second_minimum.other_vtpv,
-        "difference": second_minimum.difference,
-        "evidence": second_minimum.evidence,
-        "probability": second_minimum.probability,
-        "ambiguous": second_minimum.ambiguous,
-        "taken": second_minimum.taken,
-        "turn": second_minimum.turn * adjustment.angle_scale,
-        "shift": second_minimum.shift,
+        "ambiguity": minimum.ambiguity,
+        "images": list(minimum.images),
+        "vtpv": minimum.vtpv,
+        "other_vtpv": minimum.other_vtpv,
+        "difference": minimum.difference,
+        "evidence": minimum.evidence,
+        "probability": minimum.probability,
+        "ambiguous": minimum.ambiguous,
+        "taken": minimum.taken,
+        "turn": minimum.turn * adjustment.angle_scale,
+        "shift": minimum.shift,
     }
 
 
 def _far_points(adjustment: "Adjustment") -> dict:
-    points = adjustment.far_points
-    if points is None:
+    far_points = adjustment.far_points
+    if far_points is None:
         return {}
     columns = {name: column.tolist() for name, column in adjustment.table("far_points").items()}
-    inverse = zip(points.inverse_distance.tolist(), points.sigma_inverse_distance.tolist())
+    inverse = zip(far_points.inverse_distance.tolist(), far_points.sigma_inverse_distance.tolist())
     return {
-        "origin": dict(zip("XYZ", points.origin.tolist())),
+        "origin": dict(zip("XYZ", far_points.origin.tolist())),
         "points": {
             point: {
                 "direction": {axis: columns[f"u{axis}"][i] for axis in "XYZ"},
@@ -269,7 +274,7 @@ def _residuals(table: Mapping[str, np.ndarray]) -> Iterator[dict]:
         yield dict(zip(table, row))
 
 
-def _predicted(adjustment: "Adjustment") -> dict:
+def _control_prediction(adjustment: "Adjustment") -> dict:
     points, rays = (adjustment.table(name) for name in ("control", "control_measurements"))
     error = lambda row, axes: (
         {a: {"error": row[f"d{a}"], "sigma": row[f"s{a}"]} for a in axes}
@@ -285,7 +290,7 @@ def _predicted(adjustment: "Adjustment") -> dict:
     }
 
 
-def _checks(adjustment: "Adjustment") -> dict:
+def _check_points(adjustment: "Adjustment") -> dict:
     table = {name: column.tolist() for name, column in adjustment.table("checks").items()}
     if not table:
         return {}

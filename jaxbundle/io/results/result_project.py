@@ -15,7 +15,7 @@ from jaxbundle.network.kinds import (
     ObservationTable,
     RobotPoses,
 )
-from jaxbundle.network.kinds.base import present_kinds
+from jaxbundle.network.kinds.base import included_tables
 from jaxbundle.network.subsets import keep_distances, keep_points
 from jaxbundle.network.tables import ESTIMATED, Camera, Images, Network, Points
 
@@ -45,12 +45,12 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
         dataclasses.replace(
             with_start(camera, adjustment.camera_parameters(camera.id))
             if get_model(camera.model).prior
-            else _unobserved(camera, adjustment),
+            else _camera_without_priors(camera, adjustment),
             free=tuple(name for name in camera.unknowns if (camera.id, name) not in eliminated),
         )
         for camera in network.cameras
     )
-    is_used = problem.used
+    used_rows = problem.used
     roles = tuple("tie" if role == "control" else role for role in points.role)
     adjusted = network.replace(
         cameras=cameras,
@@ -68,7 +68,7 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
             position=adjustment.point_values,
             sigma=np.full_like(points.sigma, np.nan),
         ),
-        observations=rays.take(is_used),
+        observations=rays.take(used_rows),
         datum="inner",
         datum_points=(),
         further=_interfaces_at_solution(adjustment),
@@ -98,12 +98,12 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     )
     cameras = tuple(
         dataclasses.replace(
-            _unobserved(camera, adjustment),
+            _camera_without_priors(camera, adjustment),
             free=tuple(name for name in camera.unknowns if (camera.id, name) not in eliminated),
         )
         for camera in network.cameras
     )
-    weight, is_used = problem.image_weights, problem.used
+    weight, used_rows = problem.image_weights, problem.used
     distance_weight = _weights(problem, "distance", (len(network.distances), 1)).ravel()
     adjusted = network.replace(
         cameras=cameras,
@@ -115,14 +115,14 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
             np.where(images.sigma == 0, 0.0, np.nan),
             images.source,
         ),
-        points=_given_points(adjustment),
+        points=_points_with_given_control(adjustment),
         observations=dataclasses.replace(
             rays,
             sigma=_sigma(weight, np.nan),
             sigma_origin=ESTIMATED if adjustment.sigma_factors else rays.sigma_origin,
-        ).take(is_used),
+        ).take(used_rows),
         distances=dataclasses.replace(network.distances, sigma=_sigma(distance_weight, np.nan)),
-        further=_join_tables(*_other_kinds(adjustment), *_priors(adjustment)),
+        further=_join_tables(*_further_observations(adjustment), *_priors(adjustment)),
         warnings=(),
         notes=("the adjusted network",),
     )
@@ -132,47 +132,45 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
 
 def _interfaces_at_solution(adjustment: "Adjustment") -> tuple[ObservationTable, ...]:
     """The interfaces of a network as they were estimated: without them rays would be straight."""
-    estimates = adjustment.further_unknowns
+    unknowns = adjustment.further_unknowns
     radians = 1 / adjustment.angle_scale
     return tuple(
-        kind.at(estimates, radians)
-        for kind in adjustment.problem.network.further
-        if isinstance(kind, Interfaces)
+        table.held_at(unknowns, radians)
+        for table in adjustment.problem.network.further
+        if isinstance(table, Interfaces)
     )
 
 
-def _unobserved(camera: Camera, adjustment: "Adjustment") -> Camera:
+def _camera_without_priors(camera: Camera, adjustment: "Adjustment") -> Camera:
     """A camera at its adjusted values, without priors."""
     parameters = adjustment.camera_parameters(camera.id)
     return dataclasses.replace(camera, parameters=parameters, sigma={}, observed={})
 
 
 def _weights(
-    problem: "NetworkProblem", name: str, otherwise: tuple[int, int]
+    problem: "NetworkProblem", name: str, absent_shape: tuple[int, int]
 ) -> Float[np.ndarray, "rows residuals"]:
     """1/σ of a set of observations; of one that the network lacks, zeros of the shape given."""
-    is_known = any(o.name == name for o in problem.observations)
-    return problem.weights(name) if is_known else np.zeros(otherwise)
+    is_declared = any(o.name == name for o in problem.observations)
+    return problem.weights(name) if is_declared else np.zeros(absent_shape)
 
 
-def _sigma(weight: Float[np.ndarray, "..."], otherwise: float) -> Float[np.ndarray, "..."]:
-    """σ of the engine's weights, which are 1/σ; `otherwise` where nothing was used."""
-    return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), otherwise)
+def _sigma(weight: Float[np.ndarray, "..."], unused_sigma: float) -> Float[np.ndarray, "..."]:
+    """σ of the engine's weights, which are 1/σ; `unused_sigma` where nothing was used."""
+    return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), unused_sigma)
 
 
-def _given_points(adjustment: "Adjustment") -> Points:
+def _points_with_given_control(adjustment: "Adjustment") -> Points:
     """Points at their adjusted coordinates, controlled axes at the given ones; a control point of
     which no axis is used any more is a tie point."""
     problem = adjustment.problem
     points = problem.network.points
     control = np.flatnonzero(points.has_role("control"))
     weight = _weights(problem, "control", (0, 3))
-    given_coordinates = (
-        np.asarray(problem.data.measured.get("control", np.zeros((0, 3)))) + problem.origin
-    )
+    observed = np.asarray(problem.data.measured.get("control", np.zeros((0, 3)))) + problem.origin
     position, sigma = adjustment.point_values.copy(), np.full_like(points.sigma, np.nan)
     sigma[control] = _sigma(weight, np.inf)
-    position[control] = np.where(weight > 0, given_coordinates, position[control])
+    position[control] = np.where(weight > 0, observed, position[control])
     roles = np.array(points.role, dtype=object)
     roles[control[~(weight > 0).any(1)]] = "tie"
     # A tie point has no observed coordinates.
@@ -184,24 +182,24 @@ def _priors(adjustment: "Adjustment") -> list[ObservationTable]:
     """What was observed of orientations and cameras."""
     problem = adjustment.problem
     network, measured = problem.network, problem.data.measured
-    sets = {o.name: o for o in problem.observations}
+    observation_sets = {o.name: o for o in problem.observations}
     tables: list[ObservationTable] = []
-    if "exterior" in sets:
+    if "exterior" in observation_sets:
         value = np.asarray(measured["exterior"]) + np.concatenate([problem.origin, np.zeros(3)])
-        image = tuple(network.images.id[k] for k in sets["exterior"].rows[0])
+        image = tuple(network.images.id[k] for k in observation_sets["exterior"].rows[0])
         sigma = _sigma(problem.weights("exterior"), np.inf)
         tables.append(ExteriorPriors(image=image, value=value, sigma=sigma))
     eliminated = {(name.id, name.parameter) for name in adjustment.eliminated}
     rows = []
     for table in problem.cameras:
-        if table.interior_set not in sets:
+        if table.interior_set not in observation_sets:
             continue
         weights = problem.weights(table.interior_set)
-        for row, of_table in enumerate(sets[table.interior_set].rows[0]):
-            camera = network.cameras[table.cameras[of_table]]
+        for row, table_row in enumerate(observation_sets[table.interior_set].rows[0]):
+            camera = network.cameras[table.cameras[table_row]]
             for j, name in enumerate(table.parameters):
-                has_prior = weights[row, j] > 0 and name in camera.unknowns
-                if has_prior and (camera.id, name) not in eliminated:
+                is_used = weights[row, j] > 0 and name in camera.unknowns
+                if is_used and (camera.id, name) not in eliminated:
                     value = float(measured[table.interior_set][row, j])
                     rows.append((camera.id, name, value, float(1 / weights[row, j])))
     if rows:
@@ -214,47 +212,51 @@ def _priors(adjustment: "Adjustment") -> list[ObservationTable]:
     return tables
 
 
-def _join_tables(*tables_to_join: ObservationTable) -> tuple[ObservationTable, ...]:
+def _join_tables(*further: ObservationTable) -> tuple[ObservationTable, ...]:
     """One table of each kind: priors follow the rows of the same kind that the network had."""
     tables: dict[str, ObservationTable] = {}
-    for table in tables_to_join:
-        earlier = tables.get(table.TABLE)
-        if earlier is None:
+    for table in further:
+        earlier_table = tables.get(table.TABLE)
+        if earlier_table is None:
             tables[table.TABLE] = table
             continue
         names = [f.name for f in dataclasses.fields(table) if f.name not in ("settings", "source")]
         join = lambda a, b: np.concatenate([a, b]) if isinstance(a, np.ndarray) else (*a, *b)
-        joined: dict = {name: join(getattr(earlier, name), getattr(table, name)) for name in names}
-        tables[table.TABLE] = type(table)(**joined, settings=earlier.settings)
+        joined_columns: dict = {
+            name: join(getattr(earlier_table, name), getattr(table, name)) for name in names
+        }
+        tables[table.TABLE] = type(table)(**joined_columns, settings=earlier_table.settings)
     return tuple(tables.values())
 
 
-def _other_kinds(adjustment: "Adjustment") -> list[ObservationTable]:
+def _further_observations(adjustment: "Adjustment") -> list[ObservationTable]:
     """The observations of further kinds without those removed by data snooping, with their final σ:
     a kind with one observation per row of its table is followed row by row."""
     problem = adjustment.problem
     network = problem.network
     # The engine's sets in the order of declaration, the user's own before those of the network.
-    kinds = sorted(present_kinds(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
+    kinds = sorted(included_tables(network), key=lambda table: not table.CHANGES_IMAGE_POINTS)
     numbers = [len(table.declare(network, problem.origin).observations) for table in kinds]
-    number_own = len(problem.further_sets) - sum(numbers)
-    names, tables = iter(problem.further_sets[number_own:]), []
+    user_set_count = len(problem.further_sets) - sum(numbers)
+    names, tables = iter(problem.further_sets[user_set_count:]), []
     for table, number in zip(kinds, numbers):
         if not number:
             tables.append(table)
             continue
-        first_set, *_ = [problem.observations_of(next(names)) for _ in range(number)]
-        factor = adjustment.sigma_factors.get(first_set.kind.name, 1.0)
+        observation_set, *_ = [problem.observations_of(next(names)) for _ in range(number)]
+        factor = adjustment.sigma_factors.get(observation_set.kind.name, 1.0)
         if isinstance(table, RobotPoses) and number > 1:
             table, factor = table.rescale(adjustment.sigma_factors), 1.0
         for name, power in (("sigma", 1), ("covariance", 2)):
             if factor != 1 and hasattr(table, name):
                 changed: dict = {name: getattr(table, name) * factor**power}
                 table = dataclasses.replace(table, **changed)
-        if first_set.number == len(table):
-            largest_weight = (
-                np.abs(np.asarray(problem.weights(first_set.name))).reshape(len(table), -1).max(1)
+        if observation_set.number == len(table):
+            row_weights = (
+                np.abs(np.asarray(problem.weights(observation_set.name)))
+                .reshape(len(table), -1)
+                .max(1)
             )
-            table = table.take(largest_weight > 0)
+            table = table.take(row_weights > 0)
         tables += [table] if len(table) else []
     return tables

@@ -33,19 +33,17 @@ def write_tree(path: str | Path, tree: Any, classes: Sequence[type]) -> None:
         np.savez_compressed(file, **content)
 
 
-def read_tree(path: str | Path, classes: Sequence[type], content: str) -> Any:
-    """Read a tree of `write_tree`; `content` names the expected content in messages.
+def read_tree(path: str | Path, classes: Sequence[type], expected: str) -> Any:
+    """Read a tree of `write_tree`; `expected`: its content in words, for messages.
 
     **Raises:** `InputError` for a missing file, or other content."""
-    arrays = read_arrays(path, content)
-    damaged = InputError(f"{path}: is not {content}, or is damaged")
+    arrays = read_arrays(path, expected)
+    damaged = InputError(f"{path}: is not {expected}, or is damaged")
     if HEAD not in arrays:
         raise damaged
     document = parse_json(path, arrays.pop(HEAD).tobytes().decode(errors="replace"))
     try:
-        return _restore(
-            document, arrays, {known_class.__name__: known_class for known_class in classes}
-        )
+        return _restore(document, arrays, {cls.__name__: cls for cls in classes})
     except (ValueError, TypeError, LookupError, AttributeError):
         # Classes refuse what does not fit their fields by errors of their own.
         raise damaged from None
@@ -65,46 +63,46 @@ def flatten(
 ) -> tuple[bytes, dict[str, np.ndarray]]:
     """JSON text, and the arrays it refers to by name."""
     arrays: dict[str, np.ndarray] = {}
-    names = {known_class: known_class.__name__ for known_class in classes}
+    names = {cls: cls.__name__ for cls in classes}
 
-    def plain(value: Any) -> Any:
+    def serialise(value: Any) -> Any:
         if value is None or isinstance(value, bool | int | float | str):
             return value
         if isinstance(value, tuple(without)):
             return None
         if isinstance(value, np.generic):
-            return plain(value.item())
+            return serialise(value.item())
         if isinstance(value, np.ndarray | jax.Array):
             array = np.asarray(value)
             if array.dtype.kind in "biuf":
                 arrays[f"array{len(arrays)}"] = array
                 return {"array": f"array{len(arrays) - 1}"}
         if isinstance(value, tuple):
-            return {"tuple": [plain(known_class) for known_class in value]}
+            return {"tuple": [serialise(element) for element in value]}
         if isinstance(value, list):
-            return [plain(known_class) for known_class in value]
+            return [serialise(element) for element in value]
         if isinstance(value, Mapping):
-            return {"map": [[plain(key), plain(known_class)] for key, known_class in value.items()]}
+            return {"map": [[serialise(key), serialise(element)] for key, element in value.items()]}
         if type(value) in names:
             kind: Any = type(value)
             fields = [f.name for f in dataclasses.fields(kind)]
-            return {names[kind]: {name: plain(getattr(value, name)) for name in fields}}
+            return {names[kind]: {name: serialise(getattr(value, name)) for name in fields}}
         raise InputError(f"a {type(value).__name__} cannot be saved")
 
-    return json.dumps(plain(tree), ensure_ascii=False).encode(), arrays
+    return json.dumps(serialise(tree), ensure_ascii=False).encode(), arrays
 
 
 def _restore(value: Any, arrays: Mapping[str, np.ndarray], classes: Mapping[str, type]) -> Any:
-    restore = lambda part: _restore(part, arrays, classes)
+    restore = lambda element: _restore(element, arrays, classes)
     if isinstance(value, list):
-        return [restore(part) for part in value]
+        return [restore(element) for element in value]
     if not isinstance(value, dict):
         return value
     ((kind, content),) = value.items()
     if kind == "array":
         return arrays[content]
     if kind == "tuple":
-        return tuple(restore(part) for part in content)
+        return tuple(restore(element) for element in content)
     if kind == "map":
-        return {restore(key): restore(part) for key, part in content}
-    return classes[kind](**{name: restore(part) for name, part in content.items()})
+        return {restore(key): restore(element) for key, element in content}
+    return classes[kind](**{name: restore(element) for name, element in content.items()})

@@ -49,7 +49,7 @@ class ControlFile(NamedTuple):
     σ of these, the line of each."""
 
     id: list[str]
-    place: Float[np.ndarray, "points 3"]
+    geographic: Float[np.ndarray, "points 3"]
     sigma: Float[np.ndarray, "points 3"]
     row: Int[np.ndarray, " points"]
     image: list[str]
@@ -69,8 +69,8 @@ def read_gcp(path: str | Path) -> ControlFile:
         if not words:
             continue
         where = f"{path}, line {number}"
-        number_left = len(words) - FIELDS_OF_POINT
-        if number_left < 0 or number_left % FIELDS_OF_IMAGE:
+        image_fields = len(words) - FIELDS_OF_POINT
+        if image_fields < 0 or image_fields % FIELDS_OF_IMAGE:
             raise InputError(
                 f"{where}: {len(words)} fields; expected id, latitude, longitude, height, three σ, "
                 "and for every image its name, column, row and two σ"
@@ -85,12 +85,12 @@ def read_gcp(path: str | Path) -> ControlFile:
             rays.append((words[k], len(points) - 1, (row, column), sigma[::-1]))
     if not points:
         raise InputError(f"{path}: no control point; expected one per line")
-    id, place, sigma, row = zip(*points)
+    id, geographic, sigma, row = zip(*points)
     image, point, xy, xy_sigma = zip(*rays) if rays else ((), (), (), ())
     table = lambda rows, width: np.array(rows, float).reshape(-1, width)
     return ControlFile(
         list(id),
-        table(place, 3),
+        table(geographic, 3),
         table(sigma, 3),
         np.array(row, int),
         list(image),
@@ -106,22 +106,22 @@ def read_match(path: str | Path) -> tuple[Float[np.ndarray, "n 2"], Float[np.nda
     **Raises:** `InputError` for a file that is cut or of another kind.
     """
     content = read_content(path, text=False)
-    wrong = InputError(f"{path}: is cut, or no binary match file of Ames Stereo Pipeline")
+    error = InputError(f"{path}: is cut, or no binary match file of Ames Stereo Pipeline")
     if len(content) < 16:
-        raise wrong
-    number_first, number_second = np.frombuffer(content, "<u8", 2).tolist()
-    if number_first != number_second or 16 + 2 * number_first * RECORD.itemsize > len(content):
-        raise wrong
-    places, offset = np.empty((2 * number_first, 2)), 16
-    for k in range(2 * number_first):
+        raise error
+    first_count, second_count = np.frombuffer(content, "<u8", 2).tolist()
+    if first_count != second_count or 16 + 2 * first_count * RECORD.itemsize > len(content):
+        raise error
+    xy, offset = np.empty((2 * first_count, 2)), 16
+    for k in range(2 * first_count):
         if offset + RECORD.itemsize > len(content):
-            raise wrong
+            raise error
         record = np.frombuffer(content, RECORD, 1, offset)[0]
-        places[k] = record["xy"][::-1]
+        xy[k] = record["xy"][::-1]
         offset += RECORD.itemsize + 4 * int(record["length"])
     if offset != len(content):
-        raise wrong
-    return places[:number_first], places[number_first:]
+        raise error
+    return xy[:first_count], xy[first_count:]
 
 
 def images_of_match(path: Path, names: Sequence[str]) -> tuple[str, str]:
@@ -130,11 +130,11 @@ def images_of_match(path: Path, names: Sequence[str]) -> tuple[str, str]:
     **Raises:** `InputError` if its name does not contain two of them.
     """
     stem = path.stem.removesuffix("-clean")
-    for first_name in sorted(names, key=len, reverse=True):
-        for second_name in names:
-            pair = f"{first_name}__{second_name}"
+    for first_image in sorted(names, key=len, reverse=True):
+        for second_image in names:
+            pair = f"{first_image}__{second_image}"
             if stem == pair or stem.endswith(f"-{pair}"):
-                return first_name, second_name
+                return first_image, second_image
     raise InputError(
         f"{path}: the name of a match file is PREFIX-IMAGE1__IMAGE2.match; no two images of "
         f"[images] ({', '.join(names)}, ids or names of their files) are in {show(path.name)}"
@@ -161,22 +161,24 @@ def join_matches(
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    ends = [np.c_[np.full(len(xy), i), xy] for i, j, a, b in pairs for i, xy in ((i, a), (j, b))]
-    places, place_numbers = np.unique(np.concatenate(ends), axis=0, return_inverse=True)
+    pair_ends = [
+        np.c_[np.full(len(xy), i), xy] for i, j, a, b in pairs for i, xy in ((i, a), (j, b))
+    ]
+    positions, inverse = np.unique(np.concatenate(pair_ends), axis=0, return_inverse=True)
     # The same numbers of both ends of every pair.
-    sides = np.split(place_numbers.ravel(), np.cumsum([len(rows) for rows in ends])[:-1])
-    first_side, second_side = (np.concatenate(sides[k::2]) for k in (0, 1))
-    shape = (len(places), len(places))
-    graph = coo_array((np.ones(len(first_side)), (first_side, second_side)), shape)
+    sides = np.split(inverse.ravel(), np.cumsum([len(rows) for rows in pair_ends])[:-1])
+    first_positions, second_positions = (np.concatenate(sides[k::2]) for k in (0, 1))
+    shape = (len(positions), len(positions))
+    graph = coo_array((np.ones(len(first_positions)), (first_positions, second_positions)), shape)
     _, point = connected_components(graph, directed=False)
-    image = places[:, 0].astype(int)
+    image = positions[:, 0].astype(int)
     # Two places in one image are not one point.
     _, counts = np.unique(np.c_[point, image], axis=0, return_counts=True)
-    twice = np.unique(np.c_[point, image], axis=0)[counts > 1, 0]
-    is_kept = ~np.isin(point, twice)
-    _, renumbered = np.unique(point[is_kept], return_inverse=True)
-    order = np.argsort(image[is_kept], kind="stable")
-    left_out = len(np.unique(twice))
+    ambiguous_points = np.unique(np.c_[point, image], axis=0)[counts > 1, 0]
+    is_unique = ~np.isin(point, ambiguous_points)
+    _, renumbered = np.unique(point[is_unique], return_inverse=True)
+    order = np.argsort(image[is_unique], kind="stable")
+    left_out = len(np.unique(ambiguous_points))
     return JoinedMatches(
-        image[is_kept][order], renumbered[order], places[is_kept, 1:][order], left_out
+        image[is_unique][order], renumbered[order], positions[is_unique, 1:][order], left_out
     )

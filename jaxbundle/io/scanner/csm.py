@@ -99,21 +99,25 @@ def read_csm(
     check_size(lines, pixels, f"{path}: image_lines, image_samples")
     lines, pixels = int(lines), int(pixels)
     times, backwards = _line_times(isd, lines)
-    ends = np.array([float(times.time(line)) for line in (0.0, lines - 1.0)])
-    when = np.linspace(ends[0], ends[1], lines) if times.table is None else np.asarray(times.table)
+    end_times = np.array([float(times.time(line)) for line in (0.0, lines - 1.0)])
+    line_times = (
+        np.linspace(end_times[0], end_times[1], lines)
+        if times.table is None
+        else np.asarray(times.table)
+    )
     settings = DEFAULTS
     if extrapolate is not None:
         limits = {"min_extrapolation": extrapolate, "max_extrapolation": extrapolate}
         settings = dataclasses.replace(settings, **limits)
-    states = states_of(isd, -when if backwards else when, interpolation, settings)
+    states = states_of(isd, -line_times if backwards else line_times, interpolation, settings)
     if backwards:
         # The same poses in the same lines; only corrections depend on the direction of time.
         t, P, rows, R = states[:4]
         states = states._replace(t=-t[::-1], P=P[::-1], rows=-rows[::-1], R=R[::-1])
-    middle = view_directions(states.t, states.P, states.rows, states.R, ends.mean())
-    optics, turn = optics_of(isd, pixels, *middle)
+    middle = view_directions(states.t, states.P, states.rows, states.R, end_times.mean())
+    optics, rotation = optics_of(isd, pixels, *middle)
     image = make_image(
-        trajectory_of(states, turn, interpolation, order),
+        trajectory_of(states, rotation, interpolation, order),
         times,
         optics,
         lines,
@@ -162,14 +166,14 @@ def refuse_map(isd: JsonFields) -> None:
     """Refuse an image whose rows are not the lines of the scanner: ALE states the projection and
     GDAL's transformation (x₀, dx, 0, y₀, 0, dy) of the file, empty and the identity for a raw one.
     """
-    todo = (
+    remedy = (
         "; give the support data (ISD) and the file of the whole raw image, before map projection"
     )
     projection = isd.get("projection")
     if projection:
         raise InputError(
             f"{isd.path}: its image is a map, projection {show(projection)}: its rows are not the "
-            f"lines of the scanner{todo}"
+            f"lines of the scanner{remedy}"
         )
     if isd.get("geotransform") is None:
         return
@@ -178,7 +182,7 @@ def refuse_map(isd: JsonFields) -> None:
         raise InputError(
             f"{isd.path}: geotransform is {show(isd.get('geotransform'))}: its image is a crop, or "
             f"resampled: line {y:g}, sample {x:g} and steps of {dy:g} and {dx:g} of the image that "
-            f"the scanner took{todo}"
+            f"the scanner took{remedy}"
         )
 
 
@@ -199,11 +203,11 @@ def _line_times(isd: JsonFields, lines: int) -> tuple[LineTimes, bool]:
         raise InputError(
             f"{isd.path}: line_scan_rate needs rows of a positive period, or all of a negative one"
         )
-    first_line, start, period = (rates * np.array([1, -1, -1]) if backwards else rates).T
+    first_lines, start, period = (rates * np.array([1, -1, -1]) if backwards else rates).T
     # The centre of line l is l + ½ in the coordinates of the ISD.
     l = np.arange(lines)
-    row = np.clip(np.searchsorted(first_line, l + 0.5, side="right") - 1, 0, None)
-    t = start[row] + period[row] * (l + 1 - first_line[row])
+    row = np.clip(np.searchsorted(first_lines, l + 0.5, side="right") - 1, 0, None)
+    t = start[row] + period[row] * (l + 1 - first_lines[row])
     # One rate: times follow from it, and need no table.
     if (row == row[0]).all():
         return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]])), backwards

@@ -38,16 +38,16 @@ def optics_of(
     X, Y = f * frame.slopes(*sights)
     pitch = (X[-1] - X[0]) / (pixels - 1)
     # 1e-9 of the focal plane are below a thousandth of a pixel, and far above the rounding of Y
-    straight = np.abs(Y - Y[0]).max() < 1e-9 * max(np.abs(X).max(), abs(f))
-    if kind == "radial" and f > 0 and straight:
+    is_straight = np.abs(Y - Y[0]).max() < 1e-9 * max(np.abs(X).max(), abs(f))
+    if kind == "radial" and f > 0 and is_straight:
         K = -isd.array("optical_distortion.radial.coefficients", (None,))
         model = get_model("usgs")
-        by_name = {"c": f, **{f"K{k}": value for k, value in enumerate(K)}}
-        parameters = jnp.asarray([by_name.get(name, 0.0) for name in model.parameters])
+        values = {"c": f, **{f"K{k}": value for k, value in enumerate(K)}}
+        parameters = jnp.asarray([values.get(name, 0.0) for name in model.parameters])
         pitch, middle, row = (jnp.asarray(v) for v in (pitch, -X[0] / pitch, Y[0]))
-        return FocalLine(parameters, pitch, middle, row, "usgs"), frame.turn
+        return FocalLine(parameters, pitch, middle, row, "usgs"), frame.rotation
     psi = np.arctan(frame.slopes(*undistorted) / f)
-    return AngleTable(*map(jnp.asarray, psi)), frame.turn
+    return AngleTable(*map(jnp.asarray, psi)), frame.rotation
 
 
 def _focal_plane(isd: JsonFields, u: Float[np.ndarray, " pixels"]) -> Float[np.ndarray, "2 pixels"]:
@@ -103,9 +103,9 @@ def _distortion(
             a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
             a, b = (np.r_[c, np.zeros(10)][:10] for c in (a, b))
             return kind, _transverse(isd, a, b, x, y)
-    known_kinds = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
+    choices = f"{', '.join(DISTORTIONS[:-1])} or {DISTORTIONS[-1]}"
     raise InputError(
-        f"{isd.path}: optical_distortion {show(kind)} is not supported; expected {known_kinds}"
+        f"{isd.path}: optical_distortion {show(kind)} is not supported; expected {choices}"
     )
 
 

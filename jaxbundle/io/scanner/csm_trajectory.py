@@ -51,7 +51,7 @@ UNITS = {"m": 1.0, "km": 1000.0}
 LAGRANGE_ORDER = 7
 Times = Float[np.ndarray, " n"]
 # Rotations at times.
-Turns = Callable[[Times], Rotation]
+RotationFunction = Callable[[Times], Rotation]
 
 
 class States(NamedTuple):
@@ -96,7 +96,7 @@ def states_of(
     older = "sensor_position" in isd.document and "instrument_position" not in isd.document
     if older:
         return _read_even_table(isd, lines, settings)
-    return _resample(isd, lines, interpolation, settings)
+    return _resample_tables(isd, lines, interpolation, settings)
 
 
 def pose_at_centre(isd: JsonFields) -> tuple[Float[np.ndarray, "3"], Rotation, tuple[str, ...]]:
@@ -108,16 +108,16 @@ def pose_at_centre(isd: JsonFields) -> tuple[Float[np.ndarray, "3"], Rotation, t
     """
     if "sensor_position" in isd.document and "instrument_position" not in isd.document:
         P = isd.array("sensor_position.positions", (1, 3)) * unit_of(isd, "sensor_position", "m")
-        R, lengths = _rotations(
+        R, length_warnings = _parse_rotations(
             isd, "sensor_orientation", isd.array("sensor_orientation.quaternions", (1, 4))
         )
-        return P[0], R[0], lengths
+        return P[0], R[0], length_warnings
     P, R, warnings = poses_at(isd, np.zeros(1))
     return P[0], R[0], warnings
 
 
 def poses_at(
-    isd: JsonFields, when: Float[np.ndarray, " n"]
+    isd: JsonFields, query_times: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Rotation, tuple[str, ...]]:
     """Poses at times, seconds since the centre time: projection centres, the rotations from the
     camera into the frame of the body, and warnings. A table with a single row holds for all times;
@@ -125,42 +125,43 @@ def poses_at(
 
     **Raises:** `InputError` naming file and field.
     """
-    body_times, body, body_lengths = _turns(isd, "body_rotation")
-    times, pointing, lengths = _turns(isd, "instrument_pointing")
+    body_times, body, body_warnings = _rotation_function(isd, "body_rotation")
+    times, pointing, pointing_warnings = _rotation_function(isd, "instrument_pointing")
     position_times = _times(isd, "instrument_position")
     for name, rows in (
         ("body_rotation", body_times),
         ("instrument_pointing", times),
         ("instrument_position", position_times),
     ):
-        if len(rows) > 1 and len(when) > 1:
+        if len(rows) > 1 and len(query_times) > 1:
             step = np.diff(rows).max()
-            if when.min() < rows[0] - step or when.max() > rows[-1] + step:
+            if query_times.min() < rows[0] - step or query_times.max() > rows[-1] + step:
                 raise InputError(
                     f"{isd.path}: {name} has times from {rows[0]:.6g} to {rows[-1]:.6g} s of the "
-                    f"centre time, the image needs {when.min():.6g} to {when.max():.6g} s"
+                    f"centre time, the image needs {query_times.min():.6g} to "
+                    f"{query_times.max():.6g} s"
                 )
-    of_table = lambda t: t if len(t) == 1 else when
+    of_table = lambda t: t if len(t) == 1 else query_times
     if len(position_times) == 1:
         scale = unit_of(isd, "instrument_position", "km")
-        inertial, messages = scale * isd.array("instrument_position.positions", (1, 3)), ()
+        inertial, position_warnings = scale * isd.array("instrument_position.positions", (1, 3)), ()
     else:
-        position_at, messages = _positions(isd, position_times)
-        inertial = position_at(when)
+        position_at, position_warnings = _positions(isd, position_times)
+        inertial = position_at(query_times)
     X0 = body(of_table(position_times)).apply(inertial)
     R = body(of_table(times)) * pointing(of_table(times)).inv()
-    return X0, R, (*body_lengths, *lengths, *messages)
+    return X0, R, (*body_warnings, *pointing_warnings, *position_warnings)
 
 
-def trajectory_of(states: States, turn: Rotation, interpolation: str, order: int) -> Trajectory:
-    """The tables, the camera turned by `turn`."""
-    q = np.roll((states.R * turn).as_quat(), 1, axis=1)
+def trajectory_of(states: States, rotation: Rotation, interpolation: str, order: int) -> Trajectory:
+    """The tables, the camera turned by `rotation`."""
+    q = np.roll((states.R * rotation).as_quat(), 1, axis=1)
 
     def options(k: int, n: int) -> dict[str, Any]:
-        smallest_order = order if interpolation == "usgscsm" else min(order, n - 1)
+        table_order = order if interpolation == "usgscsm" else min(order, n - 1)
         return {
             "method": interpolation,
-            "order": smallest_order,
+            "order": table_order,
             "gap": np.inf,
             "extrapolate": states.extrapolate[k],
             "source": states.sources[k],
@@ -190,11 +191,11 @@ def view_directions(
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Approximate directions down and of flight in the camera frame: they only decide which axis
     is which, so that linear interpolation and a difference over a millisecond suffice."""
-    position, position_after = (
+    position, next_position = (
         np.array([np.interp(time + dt, t, p) for p in P.T]) for dt in (0, 1e-3)
     )
     camera = slerp(rows, R, np.array([time]))[0].inv()
-    return camera.apply(-position), camera.apply(position_after - position)
+    return camera.apply(-position), camera.apply(next_position - position)
 
 
 def _read_even_table(
@@ -209,15 +210,15 @@ def _read_even_table(
         _check_rows(isd, f"sensor_{key}", t)
         tables.append((t, isd.source(f"sensor_{key}")))
     warnings = [
-        w for t, times_at in tables for w in warn_of_extrapolation(t, lines, times_at, settings)
+        w for t, source in tables for w in warn_of_extrapolation(t, lines, source, settings)
     ]
     (t, rows), sources = zip(*tables)
-    R, lengths = _rotations(isd, "sensor_orientation", q)
+    R, length_warnings = _parse_rotations(isd, "sensor_orientation", q)
     limits = extrapolation_limit(t, settings), extrapolation_limit(rows, settings)
-    return States(t, P, rows, R, limits, sources, (*lengths, *warnings))
+    return States(t, P, rows, R, limits, sources, (*length_warnings, *warnings))
 
 
-def _resample(
+def _resample_tables(
     isd: JsonFields,
     lines: Float[np.ndarray, " lines"],
     interpolation: str,
@@ -225,8 +226,8 @@ def _resample(
 ) -> States:
     position_times = _times(isd, "instrument_position")
     _check_rows(isd, "instrument_position", position_times)
-    body_times, body, body_lengths = _turns(isd, "body_rotation")
-    pointing_times, pointing, pointing_lengths = _turns(isd, "instrument_pointing")
+    body_times, body, body_warnings = _rotation_function(isd, "body_rotation")
+    pointing_times, pointing, pointing_warnings = _rotation_function(isd, "instrument_pointing")
     tables = {
         "instrument_position": position_times,
         "instrument_pointing": pointing_times,
@@ -242,23 +243,25 @@ def _resample(
     # short image, of which the file may have two states. Hermite's cubic between states h seconds
     # apart errs by r·ω⁴·h⁴/384: in a low orbit of the Earth below a millimetre up to 14 s.
     t = np.linspace(position_times[0], position_times[-1], max(25, len(position_times)))
-    inertial, contradicted = _positions(isd, position_times)
+    inertial, position_warnings = _positions(isd, position_times)
     P = body(t).apply(inertial(t))
     if interpolation == "usgscsm":
-        merged = np.union1d(body_times, pointing_times)
-        if len(merged) == 1:
-            merged = merged + [0.0, 1.0]
-        both_rotations = body(merged) * pointing(merged).inv()
-        rows = np.linspace(merged[0], merged[-1], len(merged))
-        R = slerp(merged, both_rotations, rows)
+        union_times = np.union1d(body_times, pointing_times)
+        if len(union_times) == 1:
+            union_times = union_times + [0.0, 1.0]
+        rotations = body(union_times) * pointing(union_times).inv()
+        rows = np.linspace(union_times[0], union_times[-1], len(union_times))
+        R = slerp(union_times, rotations, rows)
     else:
         rows = np.linspace(pointing_times[0], pointing_times[-1], max(2, len(pointing_times)))
         R = body(rows) * pointing(rows).inv()
     limit_of = partial(extrapolation_limit, settings=settings)
     limits = limit_of(position_times), limit_of(pointing_times)
     sources = isd.source("instrument_position"), isd.source("instrument_pointing")
-    lengths = *body_lengths, *pointing_lengths
-    return States(t, P, rows, R, limits, sources, (*lengths, *contradicted, *warnings))
+    rotation_warnings = *body_warnings, *pointing_warnings
+    return States(
+        t, P, rows, R, limits, sources, (*rotation_warnings, *position_warnings, *warnings)
+    )
 
 
 def _check_rows(isd: JsonFields, key: str, t: Float[np.ndarray, " n"]) -> None:
@@ -273,19 +276,25 @@ def _positions(
     """Positions in the inertial frame, metres, at times; warnings."""
     scale = unit_of(isd, "instrument_position", "km")
     P = scale * isd.array("instrument_position.positions", (len(t), 3))
-    messages: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     if isd.get("instrument_position.velocities") is not None:
         V = scale * isd.array("instrument_position.velocities", (len(t), 3))
-        wrong = contradiction(t, P, V, isd.source("instrument_position.velocities"))
+        mismatch = contradiction(t, P, V, isd.source("instrument_position.velocities"))
         # Orbits are known to better than 100 m; a smaller error is interpolated as usgscsm does.
-        is_used = wrong is None or wrong.shift < 100
-        if wrong is not None:
-            todo = "used all the same" if is_used else "not used; positions are interpolated alone"
-            messages = (f"{wrong.message}: up to {wrong.shift:.2g} m between the rows; {todo}",)
-        if is_used:
-            return CubicHermiteSpline(t, P, V), messages
+        uses_velocities = mismatch is None or mismatch.shift < 100
+        if mismatch is not None:
+            treatment = (
+                "used all the same"
+                if uses_velocities
+                else "not used; positions are interpolated alone"
+            )
+            warnings = (
+                f"{mismatch.message}: up to {mismatch.shift:.2g} m between the rows; {treatment}",
+            )
+        if uses_velocities:
+            return CubicHermiteSpline(t, P, V), warnings
     table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
-    return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times)), messages
+    return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times)), warnings
 
 
 def _times(isd: JsonFields, key: str) -> Float[np.ndarray, " n"]:
@@ -295,10 +304,14 @@ def _times(isd: JsonFields, key: str) -> Float[np.ndarray, " n"]:
     return t
 
 
-def _turns(isd: JsonFields, key: str) -> tuple[Float[np.ndarray, " n"], Turns, tuple[str, ...]]:
+def _rotation_function(
+    isd: JsonFields, key: str
+) -> tuple[Float[np.ndarray, " n"], RotationFunction, tuple[str, ...]]:
     """Times, the rotation from J2000 into a frame as a function of times, and warnings."""
     t = _times(isd, key)
-    R, lengths = _rotations(isd, key, isd.array(f"{key}.quaternions", (len(t), 4))[:, [1, 2, 3, 0]])
+    R, length_warnings = _parse_rotations(
+        isd, key, isd.array(f"{key}.quaternions", (len(t), 4))[:, [1, 2, 3, 0]]
+    )
     fixed = isd.array(f"{key}.constant_rotation", (9,), np.eye(3).ravel()).reshape(3, 3)
     if not are_rotations(fixed):
         raise InputError(
@@ -309,15 +322,17 @@ def _turns(isd: JsonFields, key: str) -> tuple[Float[np.ndarray, " n"], Turns, t
     if len(t) == 1:
         has_rates = isd.get(f"{key}.angular_velocities") is not None  # null where they are unknown
         rate = isd.array(f"{key}.angular_velocities", (1, 3))[0] if has_rates else np.zeros(3)
-        turned = lambda times: constant * Rotation.from_rotvec(np.outer(times - t[0], rate)) * R[0]
-        return t, turned, lengths
-    return t, lambda times: constant * slerp(t, R, times), lengths
+        rotation_at = lambda times: (
+            constant * Rotation.from_rotvec(np.outer(times - t[0], rate)) * R[0]
+        )
+        return t, rotation_at, length_warnings
+    return t, lambda times: constant * slerp(t, R, times), length_warnings
 
 
-def _rotations(
+def _parse_rotations(
     isd: JsonFields, key: str, scalar_last: Float[np.ndarray, "n 4"]
 ) -> tuple[Rotation, tuple[str, ...]]:
     if not len(scalar_last):
         raise InputError(f"{isd.path}: {key}.quaternions is empty; expected a row for each time")
-    values, lengths = normalise_quaternions(scalar_last, isd.source(f"{key}.quaternions"))
-    return Rotation.from_quat(values), lengths
+    values, length_warnings = normalise_quaternions(scalar_last, isd.source(f"{key}.quaternions"))
+    return Rotation.from_quat(values), length_warnings

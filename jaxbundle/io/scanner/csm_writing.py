@@ -40,7 +40,7 @@ from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
 # Degree of `m_platformFlag` 1: with as many rows on each side, four beyond the ends.
-DEGREE, BEYOND = 7, 4
+DEGREE, SIDE_ROWS = 7, 4
 # From our camera frame, which looks along −z, to that of the state.
 TURN = np.diag([1.0, -1.0, -1.0])
 
@@ -85,34 +85,34 @@ def write_csm_state(
     """
     if earth is None or earth.a != earth.b:
         raise InputError(f"{path}: a model state needs an ellipsoid of revolution")
-    begin, end = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
-    begin, end = np.clip([begin, end], *_covered(image))
-    distance = _distance(image, earth, height)
-    sights = _sights(image, earth, height)
+    first_time, last_time = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    first_time, last_time = np.clip([first_time, last_time], *_covered_interval(image))
+    distance = _longest_sight(image, earth, height)
+    sights = _corrected_sights(image, earth, height)
     source = _Source(image, earth, height, sights)
     # 16 intervals of a second: usual tables have 1 to 100 rows a second
-    intervals = int(max(16, np.ceil(16 * (end - begin))))
+    intervals = int(max(16, np.ceil(16 * (last_time - first_time))))
     best = None
     while best is None or 2 * intervals <= max_rows:
-        t, P, R = _tables(source, begin, end, intervals)
-        times_between = begin + (end - begin) * (np.arange(intervals) + 0.5) / intervals
-        truth = _poses(source, times_between)
+        t, P, R = _tables(source, first_time, last_time, intervals)
+        middles = first_time + (last_time - first_time) * (np.arange(intervals) + 0.5) / intervals
+        true_poses = _poses(source, middles)
         # Of the middles of intervals, in which the error is largest.
-        P_found = _interpolate_middles(t, P - P[0], times_between) + P[0]
-        R_found = Rotation.from_quat(_interpolate_middles(t, R.as_quat(), times_between))
-        wrong = np.linalg.norm(P_found - truth[0], axis=1).max()
-        wrong += distance * (R_found.inv() * Rotation.from_matrix(truth[1])).magnitude().max()
-        wrong += len(t) * np.finfo(float).eps / 2 * np.linalg.norm(P[0])
-        if best is not None and wrong > best[0]:
+        P_found = _interpolate_middles(t, P - P[0], middles) + P[0]
+        R_found = Rotation.from_quat(_interpolate_middles(t, R.as_quat(), middles))
+        error = np.linalg.norm(P_found - true_poses[0], axis=1).max()
+        error += distance * (R_found.inv() * Rotation.from_matrix(true_poses[1])).magnitude().max()
+        error += len(t) * np.finfo(float).eps / 2 * np.linalg.norm(P[0])
+        if best is not None and error > best[0]:
             break
-        best = float(wrong), t, P, R
-        if wrong <= tolerance:
+        best = float(error), t, P, R
+        if error <= tolerance:
             break
         intervals *= 2
     assert best is not None
     trajectory, *tables = best
     optics, tangent = _optics(sights)
-    corrections = _corrections_left(source)
+    corrections = _residual_corrections(source)
     lens = tangent * distance
     fit = StateFit(trajectory + lens + corrections, trajectory, lens, corrections, len(tables[0]))
     state = _state(image, earth, (tables[0], tables[1], tables[2]), name) | optics
@@ -121,7 +121,7 @@ def write_csm_state(
     return fit
 
 
-def _covered(image: PushbroomImage) -> tuple[float, float]:
+def _covered_interval(image: PushbroomImage) -> tuple[float, float]:
     """The times that both tables cover."""
     trajectory = image.trajectory
     ends = [span(trajectory.position), span(trajectory.attitude.table)]
@@ -129,25 +129,25 @@ def _covered(image: PushbroomImage) -> tuple[float, float]:
 
 
 def _tables(
-    source: _Source, begin: float, end: float, n: int
+    source: _Source, first_time: float, last_time: float, n: int
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows 3"], Rotation]:
-    """Rows of the image and `BEYOND` on each side, continued where the image has none."""
-    step = (end - begin) / n
-    t = begin + step * np.arange(-BEYOND, n + BEYOND + 1)
-    low, high = _covered(source.image)
+    """Rows of the image and `SIDE_ROWS` on each side, continued where the image has none."""
+    step = (last_time - first_time) / n
+    t = first_time + step * np.arange(-SIDE_ROWS, n + SIDE_ROWS + 1)
+    low, high = _covered_interval(source.image)
     # Rounding of the ends.
-    is_inside = (t >= low - 1e-9 * step) & (t <= high + 1e-9 * step)
+    is_covered = (t >= low - 1e-9 * step) & (t <= high + 1e-9 * step)
     P, R = np.full((len(t), 3), np.nan), np.full((len(t), 3, 3), np.nan)
-    P[is_inside], R[is_inside] = _poses(source, np.clip(t[is_inside], low, high))
-    q = Rotation.from_matrix(np.where(is_inside[:, None, None], R, np.eye(3))).as_quat()
+    P[is_covered], R[is_covered] = _poses(source, np.clip(t[is_covered], low, high))
+    q = Rotation.from_matrix(np.where(is_covered[:, None, None], R, np.eye(3))).as_quat()
     # One sign along the table: q and −q are the same rotation.
-    for k in np.flatnonzero(is_inside)[1:]:
+    for k in np.flatnonzero(is_covered)[1:]:
         q[k] *= np.sign(q[k] @ q[k - 1]) or 1.0
-    known_rows = np.flatnonzero(is_inside)
+    covered_rows = np.flatnonzero(is_covered)
     for values in (P, q):
-        origin = values[known_rows[0]].copy()
-        for k in np.flatnonzero(~is_inside):
-            nearest_rows = known_rows[:5] if k < known_rows[0] else known_rows[-5:]
+        origin = values[covered_rows[0]].copy()
+        for k in np.flatnonzero(~is_covered):
+            nearest_rows = covered_rows[:5] if k < covered_rows[0] else covered_rows[-5:]
             # Of degree 4: a row of the tables is a thousandth of an orbit or of a jitter.
             values[k] = origin + _lagrange(t[nearest_rows], values[nearest_rows] - origin, t[k])
     return t, P, Rotation.from_quat(q)
@@ -163,18 +163,18 @@ def _interpolate_middles(
     if values.shape[1] == 4:
         values = values * signs[:, None]
     i = np.searchsorted(t, times, side="right") - 1
-    k = np.arange(1 - BEYOND, BEYOND + 1)
+    k = np.arange(1 - SIDE_ROWS, SIDE_ROWS + 1)
     weights = _weights(k.astype(float), 0.5)
     return np.einsum("j,njk->nk", weights, values[i[:, None] + k])
 
 
-def _weights(nodes: Float[np.ndarray, " n"], place: float) -> Float[np.ndarray, " n"]:
-    """Lagrange's weights of nodes at a place."""
+def _weights(nodes: Float[np.ndarray, " n"], position: float) -> Float[np.ndarray, " n"]:
+    """Lagrange's weights of nodes at a position."""
     return np.array(
         [
             np.prod(
                 [
-                    (place - other_node) / (node - other_node)
+                    (position - other_node) / (node - other_node)
                     for other_node in nodes
                     if other_node != node
                 ]
@@ -185,9 +185,9 @@ def _weights(nodes: Float[np.ndarray, " n"], place: float) -> Float[np.ndarray, 
 
 
 def _lagrange(
-    t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], place: float
+    t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], time: float
 ) -> Float[np.ndarray, " k"]:
-    return _weights((t - t[0]) / (t[1] - t[0]), (place - t[0]) / (t[1] - t[0])) @ values
+    return _weights((t - t[0]) / (t[1] - t[0]), (time - t[0]) / (t[1] - t[0])) @ values
 
 
 def _poses(
@@ -199,7 +199,7 @@ def _poses(
     padded = np.asarray(times)[np.minimum(np.arange(size), len(times) - 1)]
     u = _some_pixels(source.image)
     P, R, d = (np.asarray(a)[: len(times)] for a in _rays(*source[:3], padded, u))
-    return P, _turn_best(
+    return P, _fit_rotations(
         d, _unit_sights(source.sights[:, u])
     ) if source.image.corrections.any else R
 
@@ -214,7 +214,7 @@ def _unit_sights(slopes: Float[np.ndarray, "2 k"]) -> Float[np.ndarray, "k 3"]:
     return c / np.linalg.norm(c, axis=1, keepdims=True)
 
 
-def _turn_best(
+def _fit_rotations(
     d: Float[np.ndarray, "n k 3"], c: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n 3 3"]:
     """The rotations that turn the sights c of the camera best into the directions d."""
@@ -234,7 +234,7 @@ def _rays(
     """P, R, and unit vectors [n, k, 3] to the points of pixels at the height, Earth-fixed."""
     surface = Height(level=height, earth=earth)
 
-    def ray_at(t: Scalar) -> tuple[Array, Array, Array]:
+    def rays_at(t: Scalar) -> tuple[Array, Array, Array]:
         pose = pose_at(image, t)
 
         def direction(u: Scalar) -> Array:
@@ -244,10 +244,10 @@ def _rays(
 
         return jnp.asarray(pose.P), jnp.asarray(pose.R), jax.vmap(direction)(pixels * 1.0)
 
-    return jax.lax.map(ray_at, times, batch_size=64)
+    return jax.lax.map(rays_at, times, batch_size=64)
 
 
-def _sights(
+def _corrected_sights(
     image: PushbroomImage, earth: Ellipsoid, height: float
 ) -> Float[np.ndarray, "2 pixels"]:
     """(ξ, η) of all pixels; with what the corrections do beside a rotation in the middle line."""
@@ -256,30 +256,30 @@ def _sights(
     if not image.corrections.any:
         return slopes
     _, _, d = _rays(image, earth, height, np.asarray(image.middle_time)[None], u)
-    R = _turn_best(np.asarray(d), _unit_sights(slopes))[0]
+    R = _fit_rotations(np.asarray(d), _unit_sights(slopes))[0]
     r, s, q = R.T @ np.asarray(d)[0].T
     return np.stack([-r / q, -s / q])
 
 
-def _corrections_left(source: _Source) -> float:
+def _residual_corrections(source: _Source) -> float:
     """Metres on the ground that the corrections differ from a rotation of each line, 500 m higher
     and lower, too."""
     image, earth, height, sights = source
     if not image.corrections.any:
         return 0.0
-    begin, end = (float(image.times.time(line)) for line in (0.0, image.lines - 1.0))
-    times, u = np.linspace(begin, end, 9), _some_pixels(image)
+    first_time, last_time = (float(image.times.time(line)) for line in (0.0, image.lines - 1.0))
+    times, u = np.linspace(first_time, last_time, 9), _some_pixels(image)
     _, R = _poses(source, times)
-    sights_in_space = np.einsum("nij,kj->nki", R, _unit_sights(sights[:, u]))
-    worst = 0.0
+    model_directions = np.einsum("nij,kj->nki", R, _unit_sights(sights[:, u]))
+    largest = 0.0
     for level in (height - 500.0, height, height + 500.0):
         d = np.asarray(_rays(image, earth, level, times, u)[2])
-        angle = np.linalg.norm(np.cross(sights_in_space, d), axis=2).max()
-        worst = max(worst, float(angle) * _distance(image, earth, level))
-    return worst
+        angle = np.linalg.norm(np.cross(model_directions, d), axis=2).max()
+        largest = max(largest, float(angle) * _longest_sight(image, earth, level))
+    return largest
 
 
-def _distance(image: PushbroomImage, earth: Ellipsoid, height: float) -> float:
+def _longest_sight(image: PushbroomImage, earth: Ellipsoid, height: float) -> float:
     """The longest sight of the middle line, metres."""
     pose = pose_at(image, image.middle_time)
     surface = Height(level=height, earth=earth)
@@ -303,7 +303,7 @@ def _optics(sights: Float[np.ndarray, "2 pixels"]) -> tuple[dict[str, Any], floa
     middle = float(np.mean(u - sign * x))
     distorted = sign * (u - middle)
     row = float(np.mean(y))
-    common = {
+    common_fields = {
         "m_focalLength": f,
         "m_zDirection": 1.0,
         "m_iTransL": [0.0, 0.0, 1.0],
@@ -314,22 +314,22 @@ def _optics(sights: Float[np.ndarray, "2 pixels"]) -> tuple[dict[str, Any], floa
         "m_startingDetectorLine": 0.0,
         "m_startingDetectorSample": 0.0,
     }
-    straight = max(np.abs(x - distorted).max(), np.abs(y - row).max())
-    if straight < 1e-9:
+    straight_error = max(np.abs(x - distorted).max(), np.abs(y - row).max())
+    if straight_error < 1e-9:
         fields = {"m_detectorLineOrigin": -row, "m_distortionType": 0}
-        return common | fields | {"m_opticalDistCoeffs": [0.0, 0.0, 0.0]}, straight / f
+        return common_fields | fields | {"m_opticalDistCoeffs": [0.0, 0.0, 0.0]}, straight_error / f
     # Distorted x = a(x), y = y − b(x) = 0: cubics of the undistorted x, in units of the half line.
-    half_width = max(np.abs(x).max(), 1.0)
-    powers = np.stack([(x / half_width) ** k for k in range(4)], 1)
-    scale = half_width ** np.arange(4)
+    half_line = max(np.abs(x).max(), 1.0)
+    powers = np.stack([(x / half_line) ** k for k in range(4)], 1)
+    scale = half_line ** np.arange(4)
     a, b = (np.linalg.lstsq(powers, v, rcond=None)[0] for v in (distorted, y))
-    largest_error = np.hypot(powers @ a - distorted, powers @ b - y).max()
+    residual = np.hypot(powers @ a - distorted, powers @ b - y).max()
     terms = np.zeros((2, 10))
     terms[0, [0, 1, 3, 6]], terms[1, [0, 1, 3, 6]] = a / scale, -b / scale
     terms[1, 2] = 1.0
     fields = {"m_detectorLineOrigin": 0.0, "m_distortionType": 1}
-    return common | fields | {"m_opticalDistCoeffs": terms.ravel().tolist()}, float(
-        largest_error / f
+    return common_fields | fields | {"m_opticalDistCoeffs": terms.ravel().tolist()}, float(
+        residual / f
     )
 
 
@@ -391,10 +391,10 @@ def _line_times(image: PushbroomImage) -> tuple[list[float], list[float], list[f
     # Parts end where the time of a line is not that of its part, to a nanosecond: 8 µm of a track.
     lines, k = [0], 0
     while k < len(t):
-        is_off = np.abs(t[k:] - t[k] - steps[k] * np.arange(len(t) - k)) > 1e-9
-        if not is_off.any():
+        is_deviating = np.abs(t[k:] - t[k] - steps[k] * np.arange(len(t) - k)) > 1e-9
+        if not is_deviating.any():
             break
-        k += int(is_off.argmax())
+        k += int(is_deviating.argmax())
         lines.append(k)
     return [k + 1.0 for k in lines], t[lines].tolist(), steps[lines].tolist()
 

@@ -73,22 +73,23 @@ def read_dimap(file: XmlFields) -> ScannerInput:
     orbit = file.columns(key, [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"])
     source = points = Source(f"{path}, Ephemeris", None, "point")
     options = {"method": "lagrange", "order": min(LAGRANGE_ORDER, len(t) - 1), "gap": np.inf}
-    position_and_velocity = position_table(t, orbit, **options, source=source)
+    state_table = position_table(t, orbit, **options, source=source)
     position = position_table(t, orbit[:, :3], **options, source=source)
 
     key = "Corrected_Attitudes/Corrected_Attitude/Angles"
     rows, angles = file.times(key, epoch), file.columns(key, ["PITCH", "ROLL", "YAW"])
     source = Source(f"{path}, Corrected_Attitude", None, "row")
     check_times(rows, source)
-    when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
-    warnings = warn_of_extrapolation(rows, when, source)
-    rows, angles = _extrapolate(rows, angles, when[0], when[-1])
+    line_times = np.asarray(times.time(jnp.arange(lines, dtype=float)))
+    warnings = warn_of_extrapolation(rows, line_times, source)
+    rows, angles = _extrapolate(rows, angles, line_times[0], line_times[-1])
     # The frame of an attitude is that of the orbit at its time.
     check_covered(position, rows, points, "attitude row")
-    state = np.asarray(jax.vmap(lambda time: interpolate(position_and_velocity, time))(rows))
+    state = np.asarray(jax.vmap(lambda time: interpolate(state_table, time))(rows))
     frame = np.asarray(jax.vmap(orbital_frame)(state[:, :3], state[:, 3:]))
-    turn = Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", angles * [-1, -1, 1])  # (11)
-    attitude = attitude_table(rows, np.roll(turn.as_quat(), 1, axis=1), source=source)
+    # Equation (11).
+    rotation = Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", angles * [-1, -1, 1])
+    attitude = attitude_table(rows, np.roll(rotation.as_quat(), 1, axis=1), source=source)
 
     psi = file.columns(
         "Instrument_Look_Angles_List/Instrument_Look_Angles/Look_Angles_List/Look_Angles",
@@ -101,43 +102,46 @@ def read_dimap(file: XmlFields) -> ScannerInput:
         Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
     )
     name = file.text("Dataset_Id/DATASET_NAME", path.stem)
-    messages = (*warnings, *_not_applied(file), *unknown.messages())
+    messages = (*warnings, *_describe_unused(file), *unknown.messages())
     return ScannerInput(name, image, WGS84, messages)
 
 
-def _not_applied(file: XmlFields) -> list[str]:
+def _describe_unused(file: XmlFields) -> list[str]:
     """Warnings about what the file has of other bands, and shifts between them."""
-    messages = []
+    warnings = []
     bands = file.root.findall(".//Instrument_Look_Angles_List/Instrument_Look_Angles")
     if len(bands) > 1:
-        messages.append(
+        warnings.append(
             f"{file.path}: {len(bands)} bands have look angles of their own; those of the first, "
             f"{bands[0].findtext('BAND_INDEX', '').strip() or 'without a number'}, are used"
         )
     for name in ("DEREGISTRATION_VALUE", "COUPLED_DEREGISTRATION_VALUE"):
         value = file.number(name, 0.0)
         if value:
-            messages.append(
+            warnings.append(
                 f"{file.path}: {name} {value:g}, a shift between arrays of detectors, is not "
                 "applied: the look angles are those of the array itself"
             )
-    return messages
+    return warnings
 
 
 def _extrapolate(
-    t: Float[np.ndarray, " n"], angles: Float[np.ndarray, "n 3"], begin: float, end_time: float
+    t: Float[np.ndarray, " n"],
+    angles: Float[np.ndarray, "n 3"],
+    first_time: float,
+    last_time: float,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
-    """The rows, extrapolated linearly before `begin` and after `end_time` if required, in steps of
-    the table."""
+    """The rows, extrapolated linearly before `first_time` and after `last_time` if required, in
+    steps of the table."""
     if len(t) < 2:
         return t, angles
-    end = (t[-1], t[-1] - t[-2], angles[-1], angles[-1] - angles[-2], end_time)
-    start = (t[0], t[0] - t[1], angles[0], angles[0] - angles[1], begin)
-    for k, (last_time, step, value, change, reached) in enumerate((end, start)):
-        steps = 1 + np.arange(max(np.ceil((reached - last_time) / step), 0))
-        added_rows = last_time + steps * step, value + steps[:, None] * change
+    end = (t[-1], t[-1] - t[-2], angles[-1], angles[-1] - angles[-2], last_time)
+    start = (t[0], t[0] - t[1], angles[0], angles[0] - angles[1], first_time)
+    for k, (edge_time, step, value, change, limit_time) in enumerate((end, start)):
+        steps = 1 + np.arange(max(np.ceil((limit_time - edge_time) / step), 0))
+        extra_rows = edge_time + steps * step, value + steps[:, None] * change
         if k:
-            t, angles = np.r_[added_rows[0][::-1], t], np.vstack([added_rows[1][::-1], angles])
+            t, angles = np.r_[extra_rows[0][::-1], t], np.vstack([extra_rows[1][::-1], angles])
         else:
-            t, angles = np.r_[t, added_rows[0]], np.vstack([angles, added_rows[1]])
+            t, angles = np.r_[t, extra_rows[0]], np.vstack([angles, extra_rows[1]])
     return t, angles

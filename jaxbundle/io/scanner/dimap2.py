@@ -112,7 +112,7 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
     positions = Source(f"{path}, Point_List", None, "point")
     attitude = Source(f"{path}, Attitudes", None, "quaternion")
     last_time = period * (lines - 1)
-    rows, R, lengths = _attitudes(file, names, epoch, last_time, attitude)
+    rows, R, length_warnings = _attitudes(file, names, epoch, last_time, attitude)
     for times_of, source in ((t, positions), (rows, attitude)):
         if len(times_of) < 2:
             raise InputError(f"{source.name}: {len(times_of)} row; 2 at least")
@@ -124,7 +124,9 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
     frame = sight_frame(
         np.stack([np.polyval(p[::-1], u) for p in (y, -x)]), *tables.directions(last_time / 2)
     )
-    trajectory, messages = trajectory_of(tables, frame.turn, period * np.arange(lines))
+    trajectory, trajectory_warnings = trajectory_of(
+        tables, frame.rotation, period * np.arange(lines)
+    )
     image = make_image(
         trajectory,
         times,
@@ -134,7 +136,9 @@ def read_dimap2(file: XmlFields) -> ScannerInput:
         sources=(positions, attitude),
     )
     name = file.text("Dataset_Identification/DATASET_NAME", path.stem)
-    return ScannerInput(name, image, WGS84, (*lengths, *warnings, *messages, *unknown.messages()))
+    return ScannerInput(
+        name, image, WGS84, (*length_warnings, *warnings, *trajectory_warnings, *unknown.messages())
+    )
 
 
 def _check_level(file: XmlFields) -> None:
@@ -150,15 +154,15 @@ def _check_level(file: XmlFields) -> None:
 
 def _unit(file: XmlFields, element: ET.Element | None, units: dict[str, float]) -> float | None:
     """The unit that an element states; None if it states none."""
-    unit_word = None if element is None else element.get("unit")
-    if element is None or unit_word is None:
+    unit_name = None if element is None else element.get("unit")
+    if element is None or unit_name is None:
         return None
-    if unit_word.strip().lower() not in units:
+    if unit_name.strip().lower() not in units:
         raise InputError(
-            f"{file.path}: {element.tag} is in {show(unit_word)}; expected one of "
+            f"{file.path}: {element.tag} is in {show(unit_name)}; expected one of "
             f"{', '.join(units)}"
         )
-    return units[unit_word.strip().lower()]
+    return units[unit_name.strip().lower()]
 
 
 def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> float:
@@ -173,14 +177,14 @@ def _period(file: XmlFields, names: Names, lines: int, epoch: np.datetime64) -> 
         period > 0 and abs(unit * period * (lines - 0.5) - span) <= 0.05 * span + unit * period
     )
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
-    known_units = (PROFILES[profile],) if profile in PROFILES else ()
+    product_units = (PROFILES[profile],) if profile in PROFILES else ()
     # With few lines several units fit: that of the product is tried first.
-    for unit in (*known_units, 1.0, 1e-3, 1e-6):
+    for unit in (*product_units, 1.0, 1e-3, 1e-6):
         if fits(unit):
             return unit * period
     # Where START and END contradict it: the unit documented for the product.
-    if known_units and period > 0:
-        return known_units[0] * period
+    if product_units and period > 0:
+        return product_units[0] * period
     name = names.period.rpartition("/")[2]
     raise InputError(
         f"{file.path}: {name} is {period:g} and START to END {span:g} s for {lines} lines; "
@@ -206,13 +210,13 @@ def _attitudes(
     file: XmlFields, names: Names, epoch: np.datetime64, last_time: float, source: Source
 ) -> Attitudes:
     if names is EARLY or file.find(names.polynomials) is not None:
-        return _polynomial(file, names, epoch, last_time, source)
+        return _polynomial_attitudes(file, names, epoch, last_time, source)
     key = f"{MODEL}/Attitudes/Quaternion_List/Quaternion"
     values = file.columns(key, ("Q0", "Q1", "Q2", "Q3"))
     return file.times(key, epoch), *_rotations(values, source)
 
 
-def _polynomial(
+def _polynomial_attitudes(
     file: XmlFields, names: Names, epoch: np.datetime64, last_time: float, source: Source
 ) -> Attitudes:
     """The attitudes of a polynomial, as a table from a second before the image to one after."""

@@ -104,7 +104,7 @@ def read_flight(path: str | Path) -> FlightFile:
         optics_of(file, pixels),
         _read_track(file, earth),
         {
-            k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
+            k: _signal_in_radians(v, file.radians, f"{path}, [angles], {k}: ")
             for k, v in file.section("angles").values.items()
         },
         mounting_of(file),
@@ -124,8 +124,8 @@ def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
         return {k: track.numbers(k, 3) for k in ("start", "end" if "end" in track else "velocity")}
     if "start" in track or "end" in track:
         track.check_keys(ENDS)
-        places = {k: _place(track, k, file.radians, earth) for k in ENDS}
-        return {**places, "centre": np.zeros(3)}
+        end_positions = {k: _end_position(track, k, file.radians, earth) for k in ENDS}
+        return {**end_positions, "centre": np.zeros(3)}
     if "state" in track:
         track.check_keys(STATE)
         j2 = track.switch("j2") or "j2" not in track
@@ -135,7 +135,7 @@ def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     return {"height": track.number("height"), **angles}
 
 
-def _place(track: TomlSection, key: str, radians: float, earth: Ellipsoid) -> np.ndarray:
+def _end_position(track: TomlSection, key: str, radians: float, earth: Ellipsoid) -> np.ndarray:
     """A position Earth-fixed, of longitude, latitude and height."""
     longitude, latitude, height = track.numbers(key, 3)
     if not abs(radians * latitude) <= np.pi / 2:
@@ -143,8 +143,8 @@ def _place(track: TomlSection, key: str, radians: float, earth: Ellipsoid) -> np
             f"{track.where}{key} has a latitude of {latitude:g}; expected longitude, latitude, "
             "height, in the unit of angles and metres"
         )
-    place = radians * longitude, radians * latitude, height
-    return np.array([float(v) for v in earth_fixed(earth, place)])
+    geographic = radians * longitude, radians * latitude, height
+    return np.array([float(v) for v in earth_fixed(earth, geographic)])
 
 
 def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:
@@ -159,10 +159,10 @@ def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:
     return unit * sigma
 
 
-def _signal(value: Any, unit: float, where: str) -> float | dict[str, Any] | list[Any]:
+def _signal_in_radians(value: Any, unit: float, where: str) -> float | dict[str, Any] | list[Any]:
     """A signal with its angles in radians."""
     if isinstance(value, list):
-        return [_signal(part, unit, where) for part in value]
+        return [_signal_in_radians(part, unit, where) for part in value]
     if isinstance(value, int | float) and not isinstance(value, bool):
         return unit * value
     if not isinstance(value, Mapping):

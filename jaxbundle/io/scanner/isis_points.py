@@ -102,18 +102,18 @@ def read_control_network(path: str | Path) -> IsisPoints:
     rays: list[tuple] = []
     left_out = {"ignored": 0, "rejected by jigsaw": 0}
     residuals = []
-    first_line: dict[str, int] = {}
+    first_lines: dict[str, int] = {}
     for fields, measures in _points_of(path):
         if _is_true(fields, "IGNORE"):
             left_out["ignored"] += len(measures)
             continue
         point = _point(path, fields)
-        if point[0] in first_line:
+        if point[0] in first_lines:
             raise InputError(
                 f"{path}, line {point[4]}: point {point[0]!r} occurs twice, also in line "
-                f"{first_line[point[0]]}"
+                f"{first_lines[point[0]]}"
             )
-        first_line[point[0]] = point[4]
+        first_lines[point[0]] = point[4]
         for measure in measures:
             reason = next(
                 (words for key, words in LEFT_OUT.items() if _is_true(measure, key)), None
@@ -139,7 +139,7 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
 
     **Raises:** `InputError` naming file and line.
     """
-    path, points, rays, residuals, number_rejected = Path(path), {}, [], [], 0
+    path, points, rays, residuals, rejected_count = Path(path), {}, [], [], 0
     for number, text in enumerate(read_text(path).splitlines(), 1):
         # Three lines of head.
         if number <= 3 or not text.strip():
@@ -148,7 +148,7 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
         if not 0 <= len(fields) - len(FIELDS) <= 1:
             raise InputError(f"{where}: {len(fields)} fields; expected {', '.join(FIELDS)}")
         if fields[len(FIELDS) :] == ["*"]:
-            number_rejected += 1
+            rejected_count += 1
             continue
         sample, line, dx, dy = (number_in(word, where) for word in fields[5:9])
         point = points.setdefault(fields[0], (len(points), number))[0]
@@ -159,10 +159,8 @@ def read_jigsaw_residuals(path: str | Path) -> IsisPoints:
         raise InputError(
             f"{path}: no measurement; expected one per line, after three lines of head"
         )
-    messages = [f"{path}: {count(number_rejected, 'measurement')} rejected by jigsaw, left out"]
-    messages = (messages if number_rejected else []) + _describe_residuals(
-        path, np.array(residuals)
-    )
+    messages = [f"{path}: {count(rejected_count, 'measurement')} rejected by jigsaw, left out"]
+    messages = (messages if rejected_count else []) + _describe_residuals(path, np.array(residuals))
     unknown = (np.full(3, np.nan), np.zeros((3, 3)))
     return _gather([(id, "tie", *unknown, row) for id, (_, row) in points.items()], rays, messages)
 
@@ -187,14 +185,13 @@ def _gather(points: list[tuple], rays: list[tuple], messages: list[str]) -> Isis
 
 def _describe_residuals(path: Path, residuals: Float[np.ndarray, "n 2"]) -> list[str]:
     """What the file says of its own adjustment: the RMS of its residuals."""
-    known_residuals = residuals[np.isfinite(residuals).all(1)]
-    if not len(known_residuals):
+    finite = residuals[np.isfinite(residuals).all(1)]
+    if not len(finite):
         return []
-    line, sample = np.sqrt(np.mean(known_residuals**2, axis=0))
+    line, sample = np.sqrt(np.mean(finite**2, axis=0))
     return [
-        f"{path}: residuals of jigsaw in {count(len(known_residuals), 'measurement')}: RMS "
-        f"{line:.3g} lines, "
-        f"{sample:.3g} samples"
+        f"{path}: residuals of jigsaw in {count(len(finite), 'measurement')}: RMS {line:.3g} "
+        f"lines, {sample:.3g} samples"
     ]
 
 
@@ -243,12 +240,12 @@ def _points_of(path: Path) -> Iterator[tuple[Fields, list[Fields]]]:
 
 def _statements(path: Path) -> Iterator[_Entry]:
     """Names and values; lists in brackets and texts in quotes may have several lines."""
-    waiting: tuple[str, str, int] | None = None
+    open_entry: tuple[str, str, int] | None = None
     content = without_comments(read_text(path, fallback="latin-1"))
     for number, text in enumerate(content.splitlines(), 1):
         line = text.strip()
-        if waiting is not None:
-            name, value, first_line = waiting
+        if open_entry is not None:
+            name, value, first_line = open_entry
             value = f"{value} {line}"
         else:
             if not line:
@@ -263,11 +260,11 @@ def _statements(path: Path) -> Iterator[_Entry]:
             name, value, first_line = match[1].upper(), match[2].strip(), number
         open_list = value.startswith("(") and ")" not in value
         open_text = value.count('"') % 2 == 1
-        waiting = (name, value, first_line) if open_list or open_text else None
-        if waiting is None:
+        open_entry = (name, value, first_line) if open_list or open_text else None
+        if open_entry is None:
             yield _Entry(name, value.strip('"') if value.startswith('"') else value, first_line)
-    if waiting is not None:
-        raise InputError(f"{path}, line {waiting[2]}: {waiting[0]} is not closed{ENDS_EARLY}")
+    if open_entry is not None:
+        raise InputError(f"{path}, line {open_entry[2]}: {open_entry[0]} is not closed{ENDS_EARLY}")
 
 
 def _is_true(fields: Fields, name: str) -> bool:
@@ -338,11 +335,11 @@ def _covariance(path: Path, fields: Fields, id: _Entry) -> Float[np.ndarray, "3 
     C = np.zeros((3, 3))
     C[np.triu_indices(3)] = [number_in(word, where) for word in words]
     C = C + np.triu(C, 1).T
-    smallest = np.linalg.eigvalsh(C)[0]
-    if smallest < -1e-9 * np.trace(C):
+    smallest_eigenvalue = np.linalg.eigvalsh(C)[0]
+    if smallest_eigenvalue < -1e-9 * np.trace(C):
         raise InputError(f"{where} is no covariance: it has a negative eigenvalue")
     # Below this eigenvalues are rounding: it would hold the point along an axis of chance.
-    if smallest <= 1e-14 * np.trace(C):
+    if smallest_eigenvalue <= 1e-14 * np.trace(C):
         raise InputError(
             f"{where} has no error in one direction; give σ above 0 for all, or make the point "
             "Fixed"
@@ -355,9 +352,9 @@ def _measure(
 ) -> tuple[tuple[str, ...], tuple[float, float], tuple[float, float], int]:
     """Serial number, line and pixel, their σ, the line of a measurement."""
     line = min((entry.line for entry in fields.values()), default=0)
-    missing_fields = [name for name in ("SERIALNUMBER", "SAMPLE", "LINE") if name not in fields]
-    if missing_fields:
-        raise InputError(f"{path}, line {line}: a measure without {', '.join(missing_fields)}")
-    place = _number(path, fields, "LINE") - 1, _number(path, fields, "SAMPLE") - 1
+    missing_names = [name for name in ("SERIALNUMBER", "SAMPLE", "LINE") if name not in fields]
+    if missing_names:
+        raise InputError(f"{path}, line {line}: a measure without {', '.join(missing_names)}")
+    position = _number(path, fields, "LINE") - 1, _number(path, fields, "SAMPLE") - 1
     sigma = _number(path, fields, "LINESIGMA"), _number(path, fields, "SAMPLESIGMA")
-    return (fields["SERIALNUMBER"].value,), place, sigma, fields["SERIALNUMBER"].line
+    return (fields["SERIALNUMBER"].value,), position, sigma, fields["SERIALNUMBER"].line

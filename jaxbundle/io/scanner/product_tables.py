@@ -33,9 +33,9 @@ class Tables(NamedTuple):
 
 
 def trajectory_of(
-    tables: Tables, turn: Rotation, lines: Float[np.ndarray, " lines"]
+    tables: Tables, rotation: Rotation, lines: Float[np.ndarray, " lines"]
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """The trajectory, the camera turned by `turn`, and warnings.
+    """The trajectory, the camera turned by `rotation`, and warnings.
 
     Lagrange's polynomial through eight rows; a table that ends a little before the lines is
     extrapolated linearly (`usgscsm` of `pushbroom.interpolation`).
@@ -45,17 +45,17 @@ def trajectory_of(
     warnings: list[str] = []
 
     def options(rows: Float[np.ndarray, " n"], source: Source) -> dict[str, Any]:
-        extrapolation_warnings = warn_of_extrapolation(rows, lines, source)
-        warnings.extend(extrapolation_warnings)
+        new_warnings = warn_of_extrapolation(rows, lines, source)
+        warnings.extend(new_warnings)
         return {
-            "method": "usgscsm" if extrapolation_warnings else "lagrange",
+            "method": "usgscsm" if new_warnings else "lagrange",
             "order": min(LAGRANGE_ORDER, len(rows) - 1),
             "gap": np.inf,
             "extrapolate": extrapolation_limit(rows),
             "source": source,
         }
 
-    q = np.roll((tables.R * turn).as_quat(), 1, axis=1)
+    q = np.roll((tables.R * rotation).as_quat(), 1, axis=1)
     trajectory = Trajectory(
         position_table(tables.t, tables.P, **options(tables.t, tables.positions)),
         attitude_table(tables.rows, q, **options(tables.rows, tables.attitude)),

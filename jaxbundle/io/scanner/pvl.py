@@ -36,19 +36,21 @@ def read_support_data(path: Path) -> ET.Element:
             raise InputError(
                 f"{path}: {path.stem}.{name} is not next to it; {', '.join(GROUPS)} belong together"
             )
-        _read_into(file, ET.SubElement(root, name))
+        _add_file(file, ET.SubElement(root, name))
     return root
 
 
-def _read_into(path: Path, root: ET.Element) -> None:
+def _add_file(path: Path, root: ET.Element) -> None:
     """Add the groups and values of a file to an element."""
     text, begin, groups = without_comments(read_text(path, fallback="latin-1")), 0, [root]
-    wrong = lambda what: InputError(f"{path}, line {text[:begin].count(chr(10)) + 1}: {what}")
-    while (rest := text[begin:].strip()) and not rest.upper().startswith("END;"):
+    error_at = lambda message: InputError(
+        f"{path}, line {text[:begin].count(chr(10)) + 1}: {message}"
+    )
+    while (remainder := text[begin:].strip()) and not remainder.upper().startswith("END;"):
         begin = len(text) - len(text[begin:].lstrip())
         match = STATEMENT.match(text, begin)
         if match is None:
-            raise wrong("expected NAME = value;")
+            raise error_at("expected NAME = value;")
         name = match[1].upper()
         if name in ("BEGIN_GROUP", "END_GROUP"):
             line = text.find("\n", match.end())
@@ -57,15 +59,15 @@ def _read_into(path: Path, root: ET.Element) -> None:
             tag = re.sub(r"_\d+$", "", text[match.end() : line].strip(" \t\r;").upper())
             if name == "BEGIN_GROUP":
                 if not re.fullmatch(r"\w+", tag):
-                    raise wrong("expected the name of a group")
+                    raise error_at("expected the name of a group")
                 groups.append(ET.SubElement(groups[-1], tag))
             elif len(groups) == 1 or groups.pop().tag != tag:
-                raise wrong(f"the group {tag} ends without a beginning")
+                raise error_at(f"the group {tag} ends without a beginning")
             begin = line
             continue
         end = text.find(";", match.end())
         if end < 0 or not re.fullmatch(r"\w+", name):
-            raise wrong("expected NAME = value;")
+            raise error_at("expected NAME = value;")
         _add_value(groups[-1], name, text[match.end() : end].strip())
         begin = end + 1
     if len(groups) > 1:

@@ -125,16 +125,16 @@ def _read_product(
 def _read_xml(path: Path) -> ScannerInput:
     """The image of a product in XML, by the name of its root and the groups in it."""
     root = read_xml(path)
-    has = lambda key: root.find(f".//{key}") is not None
+    has_element = lambda key: root.find(f".//{key}") is not None
     # Early products of Pléiades have PHR_DIMAP_Document or PHR_Dimap_Document.
     if root.tag.lower().endswith("dimap_document"):
-        if has(MODEL) or has(EARLY_MODEL):
+        if has_element(MODEL) or has_element(EARLY_MODEL):
             return read_dimap2(XmlFields(path, root, "DIMAP 2 of sensor level"))
-        if has("Rational_Function_Model/Global_RFM"):
+        if has_element("Rational_Function_Model/Global_RFM"):
             raise InputError(
                 f"{path}: DIMAP of RPC alone; give it to `pushbroom rpc`, or the DIM_….XML here"
             )
-        if not has("Sensor_Configuration") and not has("Satellite_Attitudes"):
+        if not has_element("Sensor_Configuration") and not has_element("Satellite_Attitudes"):
             kind = ", ".join(
                 f"{text[:60]}"
                 for name in ("METADATA_PROFILE", "PROCESSING_LEVEL", "PRODUCT_TYPE")
@@ -146,7 +146,7 @@ def _read_xml(path: Path) -> ScannerInput:
                 "Of other levels give the RPC (RPC_….XML), if it has any, to `pushbroom rpc`"
             )
         return read_dimap(XmlFields(path, root, "DIMAP of SPOT 5"))
-    if has("GEO") and has("EPH") and has("ATT"):
+    if has_element("GEO") and has_element("EPH") and has_element("ATT"):
         return read_worldview(XmlFields(path, root, WORLDVIEW))
     raise InputError(
         f"{path}: XML of another kind, <{root.tag[:60]}>; expected DIMAP of SPOT 5, Pléiades, "

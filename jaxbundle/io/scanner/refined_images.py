@@ -33,14 +33,11 @@ def names_of_images(file: RefineFile) -> list[str]:
     """The possible files of all images of a refine file."""
     return [
         name
-        for scanner_image in file.images
+        for image in file.images
         for name in (
-            [f"{scanner_image.id}{file.rpc_ending}"]
-            if isinstance(scanner_image, RpcScannerImage)
-            else [
-                *names_of(scanner_image.id),
-                *([f"{scanner_image.id}{STATE_ENDING}"] if file.csm_states else []),
-            ]
+            [f"{image.id}{file.rpc_ending}"]
+            if isinstance(image, RpcScannerImage)
+            else [*names_of(image.id), *([f"{image.id}{STATE_ENDING}"] if file.csm_states else [])]
         )
     ]
 
@@ -49,16 +46,16 @@ def write_images(folder: Path, file: RefineFile, result: Refinement) -> dict[str
     """Write the refined images into a folder; returns how well model states fit, by image."""
     fits = {}
     heights = _mean_height(result)
-    for scanner_image in file.images:
-        image = result.image(scanner_image.id)
+    for input_image in file.images:
+        image = result.image(input_image.id)
         if isinstance(image, RpcImage):
-            write_rpc(folder / f"{scanner_image.id}{file.rpc_ending}", image.rpc)
+            write_rpc(folder / f"{input_image.id}{file.rpc_ending}", image.rpc)
         else:
-            write_scanner_image(folder, scanner_image.id, image, scanner_image.earth)
+            write_scanner_image(folder, input_image.id, image, input_image.earth)
             if file.csm_states:
-                path = folder / f"{scanner_image.id}{STATE_ENDING}"
-                fits[scanner_image.id] = write_csm_state(
-                    path, _without_corners(image), scanner_image.earth, heights, scanner_image.id
+                path = folder / f"{input_image.id}{STATE_ENDING}"
+                fits[input_image.id] = write_csm_state(
+                    path, _with_smooth_attitude(image), input_image.earth, heights, input_image.id
                 )
     return fits
 
@@ -76,21 +73,14 @@ def describe_states(fits: dict[str, StateFit]) -> Iterator[str]:
 
 def _mean_height(result: Refinement) -> float:
     """The mean height of the points, where the corrections of states hold."""
-    earth = next(
-        (
-            scanner_image.earth
-            for scanner_image in result.inputs.rigorous
-            if scanner_image.earth is not None
-        ),
-        None,
-    )
+    earth = next((image.earth for image in result.inputs.rigorous if image.earth is not None), None)
     X = np.asarray(result.positions)
     if earth is None or not len(X):
         return 0.0
     return float(np.mean(np.asarray(geodetic(earth, tuple(X.T))[2])))
 
 
-def _without_corners(image: PushbroomImage) -> PushbroomImage:
+def _with_smooth_attitude(image: PushbroomImage) -> PushbroomImage:
     """The image with Lagrange's polynomials through the quaternions instead of slerp, where these
     follow it to within twice the 1e-9 rad to which slerp follows the refined attitude: a state,
     of polynomials as well, would have to follow the corners of slerp."""
@@ -103,13 +93,12 @@ def _without_corners(image: PushbroomImage) -> PushbroomImage:
     middle = middle[(middle > low) & (middle < high)]
     if len(times) < 8 or not len(middle):
         return image
-    rotations_given, rotations_smooth = (
+    slerp_rotations, smooth_rotations = (
         np.asarray(_rotations(a, middle)) for a in (attitude, smooth)
     )
-    turn = np.linalg.norm(rotations_given - rotations_smooth, axis=(1, 2)) / np.sqrt(
-        2
-    )  # of small rotations
-    if not turn.max() < 2e-9:
+    # Of small rotations.
+    rotation_angles = np.linalg.norm(slerp_rotations - smooth_rotations, axis=(1, 2)) / np.sqrt(2)
+    if not rotation_angles.max() < 2e-9:
         return image
     return eqx.tree_at(lambda i: i.trajectory.attitude, image, smooth)
 
@@ -119,10 +108,10 @@ _rotations = compile_once(jax.vmap(attitude_at, (None, 0)))
 
 def describe_refits(result: Refinement) -> Iterator[str]:
     """Images whose compensated coefficients do not contain all of their bias, as warnings."""
-    for rpc_image in result.inputs.rpc:
-        check = result.compensated[rpc_image.id][1]
-        if check is not None and check.largest.max() > LARGEST_REFIT:
+    for image in result.inputs.rpc:
+        refit = result.compensated[image.id][1]
+        if refit is not None and refit.largest.max() > LARGEST_REFIT:
             yield (
-                f"image {rpc_image.id!r}: its compensated coefficients are up to "
-                f"{check.largest.max():.2g} pixels off its bias; give a lower bias_degree"
+                f"image {image.id!r}: its compensated coefficients are up to "
+                f"{refit.largest.max():.2g} pixels off its bias; give a lower bias_degree"
             )

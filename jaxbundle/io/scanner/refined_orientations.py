@@ -66,23 +66,20 @@ class RefinedBlock:
 
     def image_of(self, file: Path) -> RefinedFile | None:
         """The image of a refined file, if it is one of them."""
-        return next(
-            (refined_file for refined_file in self.images if refined_file.file.name == file.name),
-            None,
-        )
+        return next((image for image in self.images if image.file.name == file.name), None)
 
 
 def joint_covariance(result: Refinement) -> OrientationCovariance | None:
     """The covariance of the unknowns of all scanner images and their sensors, a posteriori; None:
     all are held."""
     unknowns = [_unknown_of(name) for name in result.names]
-    known_rows = [k for k, unknown in enumerate(unknowns) if unknown is not None]
+    unknown_rows = [k for k, unknown in enumerate(unknowns) if unknown is not None]
     C: Float[np.ndarray, "m m"] = result.covariance
-    if not known_rows:
+    if not unknown_rows:
         return None
     return OrientationCovariance(
-        tuple(known_unknown for known_unknown in unknowns if known_unknown is not None),
-        C[np.ix_(known_rows, known_rows)],
+        tuple(unknown for unknown in unknowns if unknown is not None),
+        C[np.ix_(unknown_rows, unknown_rows)],
     )
 
 
@@ -93,43 +90,20 @@ def _unknown_of(name: UnknownName) -> Unknown | None:
 
 
 def write_refined_orientations(
-    folder: Path, place: Path, file: RefineFile, result: Refinement
+    folder: Path, final_folder: Path, file: RefineFile, result: Refinement
 ) -> None:
-    """Write table and covariance into a folder, whose place will be `place`."""
+    """Write table and covariance into a folder, which will be `final_folder`."""
     rows = []
-    for scanner_image in file.images:
-        raster = find_raster(file.sources[scanner_image.id])
+    for image in file.images:
+        raster = find_raster(file.sources[image.id])
         # From where the folder will be: now it has a temporary name.
-        raster_path = "" if raster is None else relative_path(raster, place)
-        if isinstance(scanner_image, RpcScannerImage):
-            domain = domain_of_bias(scanner_image.image.rpc)
-            rows.append(
-                (
-                    scanner_image.id,
-                    f"{scanner_image.id}{file.rpc_ending}",
-                    raster_path,
-                    "",
-                    "",
-                    *domain,
-                )
-            )
+        raster_path = "" if raster is None else relative_path(raster, final_folder)
+        if isinstance(image, RpcScannerImage):
+            domain = domain_of_bias(image.image.rpc)
+            rows.append((image.id, f"{image.id}{file.rpc_ending}", raster_path, "", "", *domain))
         else:
-            sensor_and_spacing = (
-                scanner_image.sensor or scanner_image.id,
-                scanner_image.freedom.knot_spacing,
-            )
-            rows.append(
-                (
-                    scanner_image.id,
-                    f"{scanner_image.id}.toml",
-                    raster_path,
-                    *sensor_and_spacing,
-                    "",
-                    "",
-                    "",
-                    "",
-                )
-            )
+            sensor_fields = image.sensor or image.id, image.freedom.knot_spacing
+            rows.append((image.id, f"{image.id}.toml", raster_path, *sensor_fields, "", "", "", ""))
     write_csv(folder / TABLE, HEAD, rows)
     covariance = joint_covariance(result)
     if covariance is not None:
@@ -175,13 +149,13 @@ def read_refined_orientations(folder: Path) -> RefinedBlock | None:
 
 def _check_owners(path: Path, images: list[RefinedFile], covariance: OrientationCovariance) -> None:
     """Refuse unknowns of images that are not there: the σ would be too small."""
-    owners = {("image", scanner_image.id) for scanner_image in images} | {
-        ("sensor", scanner_image.sensor) for scanner_image in images
+    owners = {("image", image.id) for image in images} | {
+        ("sensor", image.sensor) for image in images
     }
     covered = {(kind, id) for kind, id, _ in covariance.unknowns}
-    strange = sorted(f"{kind} {id}" for kind, id in covered - owners)
-    if strange:
+    foreign_unknowns = sorted(f"{kind} {id}" for kind, id in covered - owners)
+    if foreign_unknowns:
         raise InputError(
-            f"{path}: has unknowns of {list_some(strange, 3, str)}, which {TABLE} does not list; "
-            "both are of one refinement"
+            f"{path}: has unknowns of {list_some(foreign_unknowns, 3, str)}, which {TABLE} does "
+            "not list; both are of one refinement"
         )

@@ -139,15 +139,9 @@ def read_refinement(path: str | Path) -> RefineFile:
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
     # Other programs name an image by its file, without folder and suffix.
-    sources = {
-        scanner_image.id: file.section("images").path(scanner_image.id, "an image")
-        for scanner_image in images
-    }
-    names = {
-        re.sub("(?i)_rpc$", "", sources[scanner_image.id].stem): scanner_image.id
-        for scanner_image in images
-    }
-    names |= {scanner_image.id: scanner_image.id for scanner_image in images}
+    sources = {image.id: file.section("images").path(image.id, "an image") for image in images}
+    names = {re.sub("(?i)_rpc$", "", sources[image.id].stem): image.id for image in images}
+    names |= {image.id: image.id for image in images}
     serial = file.section("serial_numbers")
     for id in serial.values:
         if id not in sources:
@@ -195,9 +189,7 @@ def _wants_states(section: TomlSection, images: Sequence[AnyScannerImage]) -> bo
     if not isinstance(wants_states, bool):
         raise InputError(f"{section.where}csm_states is {wants_states!r}; expected true or false")
     local = [
-        scanner_image.id
-        for scanner_image in images
-        if isinstance(scanner_image, ScannerImage) and scanner_image.earth is None
+        image.id for image in images if isinstance(image, ScannerImage) and image.earth is None
     ]
     if wants_states and local:
         raise InputError(
@@ -228,16 +220,14 @@ def _read_terrain(section: TomlSection, images: Sequence[AnyScannerImage]) -> He
     if sigma <= 0:
         raise InputError(f"{section.where}dem_sigma is {sigma:g}; expected metres above 0")
     extents = [
-        image_extent(scanner_image.image, scanner_image.earth)
-        if isinstance(scanner_image, ScannerImage)
-        else rpc_extent(scanner_image.image.rpc)
-        for scanner_image in images
-        if scanner_image.earth is not None
-    ]
+        image_extent(image.image, image.earth) if isinstance(image, ScannerImage) else
+        rpc_extent(image.image.rpc)
+        for image in images if image.earth is not None
+    ]  # fmt: skip
     terrain = read_terrain(path, earth, joint_extent(extents), above_geoid="geoid" in section)
     if "geoid" in section:
         # A file beside this one, or the name of a grid of PROJ.
         name = section.text("geoid")
-        beside = section.beside(name)
-        terrain = add_geoid(terrain, beside if beside.exists() else Path(name))
+        local_file = section.beside(name)
+        terrain = add_geoid(terrain, local_file if local_file.exists() else Path(name))
     return HeightModel(terrain, sigma, str(path))

@@ -40,9 +40,9 @@ def read_images(file: TomlFile, radians: float) -> tuple[list[AnyScannerImage], 
     sensors, unknowns, models = (file.section(n) for n in ("sensors", "unknowns", "models"))
     sensors.check_keys(tuple(scanners.values))
     models.check_keys(tuple(scanners.values))
-    sections_of_images = {k: v for k, v in unknowns.values.items() if isinstance(v, dict)}
-    common = {k: v for k, v in unknowns.values.items() if k not in sections_of_images}
-    for id in sections_of_images:
+    own_unknowns = {k: v for k, v in unknowns.values.items() if isinstance(v, dict)}
+    common_unknowns = {k: v for k, v in unknowns.values.items() if k not in own_unknowns}
+    for id in own_unknowns:
         if id not in scanners.values:
             raise InputError(
                 f"{path}, [unknowns.{id}]: no such image{did_you_mean(id, scanners.values)}"
@@ -50,30 +50,30 @@ def read_images(file: TomlFile, radians: float) -> tuple[list[AnyScannerImage], 
     images, warnings = [], []
     section = lambda name, values: TomlSection(file, f"{path}, [{name}]: ", values)
     fields = tuple(sorted(f.name for f in dataclasses.fields(Freedom)))
-    section("unknowns", common).check_keys((*fields, *OF_RPC))
+    section("unknowns", common_unknowns).check_keys((*fields, *OF_RPC))
     for id in scanners.values:
         source = scanners.path(id, "a scanner file, the file of a product, or an image with RPC")
-        own_keys, name = (
-            sections_of_images.get(id, {}),
-            f"unknowns.{id}" if id in sections_of_images else "unknowns",
+        own_entries, name = (
+            own_unknowns.get(id, {}),
+            f"unknowns.{id}" if id in own_unknowns else "unknowns",
         )
         is_rpc = _is_rpc(source, models, id)
-        known_keys = OF_RPC if is_rpc else fields
+        allowed_keys = OF_RPC if is_rpc else fields
         # What is common to all images is for those that have it.
-        keys_of_image = {k: v for k, v in common.items() if k in known_keys} | own_keys
-        unknowns_of_image = section(name, keys_of_image)
-        _check_own_keys(unknowns_of_image, own_keys, known_keys, is_rpc)
+        entries = {k: v for k, v in common_unknowns.items() if k in allowed_keys} | own_entries
+        unknowns_of_image = section(name, entries)
+        _check_own_keys(unknowns_of_image, own_entries, allowed_keys, is_rpc)
         if is_rpc:
-            image, image_warnings = _read_rpc_image(id, source, unknowns_of_image)
+            image, reader_warnings = _read_rpc_image(id, source, unknowns_of_image)
             images.append(image)
-            warnings += image_warnings
+            warnings += reader_warnings
             continue
         scanner = read_scanner(source)
         warnings += scanner.warnings
         freedom = _read_freedom(unknowns_of_image, radians)
         # Without an entry an image is a sensor of its own.
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
-    if all(isinstance(scanner_image, ScannerImage) for scanner_image in images):
+    if all(isinstance(image, ScannerImage) for image in images):
         file.require(("unknowns",))
     for image in images:
         if not is_same_earth(image.earth, images[0].earth):
@@ -89,62 +89,61 @@ def _is_rpc(source: Path, models: TomlSection, id: str) -> bool:
     model = models.text(id, "")
     if model not in ("", *MODELS):
         raise InputError(f"{models.where}{id} = {model!r}{did_you_mean(model, MODELS)}")
-    has_only_rpc = has_rpc_only(source)
-    if has_only_rpc and model == "rigorous":
+    is_rpc_only = has_rpc_only(source)
+    if is_rpc_only and model == "rigorous":
         raise InputError(
             f'{models.where}{id} = "rigorous": {source} has rational polynomials (RPC) only; give '
             '"rpc", or a scanner file'
         )
-    return has_only_rpc or model == "rpc"
+    return is_rpc_only or model == "rpc"
 
 
 def _check_own_keys(
-    section: TomlSection, own_keys: Mapping[str, Any], known_keys: Sequence[str], is_rpc: bool
+    section: TomlSection, own_entries: Mapping[str, Any], allowed_keys: Sequence[str], is_rpc: bool
 ) -> None:
     """Refuse unknowns of an image that only images with the other model have."""
-    for key in own_keys:
-        if key not in known_keys and (key in OF_RPC) != is_rpc:
+    for key in own_entries:
+        if key not in allowed_keys and (key in OF_RPC) != is_rpc:
             kind = "an image with RPC" if is_rpc else "a rigorous image"
             raise InputError(
-                f"{section.where}{key} is no unknown of {kind}, which has {', '.join(known_keys)}"
+                f"{section.where}{key} is no unknown of {kind}, which has {', '.join(allowed_keys)}"
             )
-    section.check_keys(known_keys)
+    section.check_keys(allowed_keys)
 
 
 def _read_rpc_image(
     id: str, path: Path, section: TomlSection
 ) -> tuple[RpcScannerImage, tuple[str, ...]]:
     """An image with RPC, its bias with priors, and warnings."""
-    rpc_input = read_rpc_image(path)
+    rpc_image = read_rpc_image(path)
     degree = section.values.get("bias_degree", 0)
     if type(degree) is not int or degree not in range(len(BIAS_TERMS)):
         raise InputError(f"{section.where}bias_degree is {show(degree)}; expected 0, 1 or 2")
-    bias_given, warnings = section.values.get("bias"), rpc_input.warnings
-    if bias_given in (None, STATED_BIAS):
+    bias, warnings = section.values.get("bias"), rpc_image.warnings
+    if bias in (None, STATED_BIAS):
         source = find_coefficients(path)
         errors = read_stated_errors(source)
         if errors.bias > 0 and (errors.random > 0 or degree == 0):
-            sigma = prior_of_errors(rpc_input.image.rpc, degree, errors.bias, errors.random)
-            return RpcScannerImage(id, rpc_input.image, sigma), warnings
-        lacking = "ERR_BIAS" if errors.bias == 0 else "ERR_RAND"
-        reason = f"{source} states no error of its coefficients ({lacking})"
-        if bias_given is not None:
+            sigma = prior_of_errors(rpc_image.image.rpc, degree, errors.bias, errors.random)
+            return RpcScannerImage(id, rpc_image.image, sigma), warnings
+        missing_field = "ERR_BIAS" if errors.bias == 0 else "ERR_RAND"
+        problem = f"{source} states no error of its coefficients ({missing_field})"
+        if bias is not None:
             raise InputError(
-                f'{section.where}bias = "stated", but {reason}; give σ in pixels, or "free"'
+                f'{section.where}bias = "stated", but {problem}; give σ in pixels, or "free"'
             )
         warnings += (
-            f"{reason}: the bias of image {id!r} is free; give bias in [unknowns] a prior σ",
+            f"{problem}: the bias of image {id!r} is free; give bias in [unknowns] a prior σ",
         )
-        return RpcScannerImage(id, rpc_input.image, prior_of_bias(degree)), warnings
-    values = bias_given if isinstance(bias_given, list) else [bias_given, bias_given]
+        return RpcScannerImage(id, rpc_image.image, prior_of_bias(degree)), warnings
+    values = bias if isinstance(bias, list) else [bias, bias]
     if len(values) != 2:
         raise InputError(
-            f"{section.where}bias is {show(bias_given)}; expected one σ, or two, of the shift and "
-            "of "
+            f"{section.where}bias is {show(bias)}; expected one σ, or two, of the shift and of "
             "the other terms, in pixels"
         )
     shift, variation = (_sigma(section, "bias", value) for value in values)
-    return RpcScannerImage(id, rpc_input.image, prior_of_bias(degree, shift, variation)), warnings
+    return RpcScannerImage(id, rpc_image.image, prior_of_bias(degree, shift, variation)), warnings
 
 
 def _read_freedom(section: TomlSection, radians: float) -> Freedom:

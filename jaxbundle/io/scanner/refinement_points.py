@@ -46,13 +46,13 @@ def read_points(
     ties_alone = "tie_points" in section and "observations" not in section
     files = [] if ties_alone else section.paths("observations", "a CSV table, .match, .gcp or .pvl")
     by_suffix = {s: [f for f in files if f.suffix.lower() == s] for s in (GCP, MATCH)}
-    of_isis = [f for f in files if f.suffix.lower() in ISIS or is_jigsaw_residuals(f)]
-    other_files = (*by_suffix[GCP], *by_suffix[MATCH], *of_isis)
-    tables = [read_csv(f) for f in files if f not in other_files]
+    isis_files = [f for f in files if f.suffix.lower() in ISIS or is_jigsaw_residuals(f)]
+    foreign_files = (*by_suffix[GCP], *by_suffix[MATCH], *isis_files)
+    tables = [read_csv(f) for f in files if f not in foreign_files]
     for table in tables:
         table.check_names(MEASURED[:4], MEASURED[4:])
     parts, warnings = [], []
-    if "points" in section or not (len(other_files) or ties_alone):
+    if "points" in section or not (len(foreign_files) or ties_alone):
         parts.append(_points_of(section.table("points"), images[0].earth, radians))
     for path in by_suffix[GCP]:
         control = read_gcp(path)
@@ -62,53 +62,55 @@ def read_points(
         if unknown:
             warnings.append(f"{path}: measurements in images that are not in [images]: {unknown}")
     if by_suffix[MATCH]:
-        table, ties, match_warnings = _matched(by_suffix[MATCH], names, [one.id for one in images])
+        table, ties, match_warnings = _matched_points(
+            by_suffix[MATCH], names, [image.id for image in images]
+        )
         tables.append(table)
         parts.append(ties)
         warnings += match_warnings
-    for path in of_isis:
-        given_ids = {id for part in parts for id in part.id}
-        network = path.suffix.lower() in ISIS
-        isis_points = read_control_network(path) if network else read_jigsaw_residuals(path)
+    for path in isis_files:
+        existing_ids = {id for part in parts for id in part.id}
+        is_network = path.suffix.lower() in ISIS
+        isis_points = read_control_network(path) if is_network else read_jigsaw_residuals(path)
         warnings += isis_points.messages
         table, unknown = _measured_by_isis(isis_points, path, names)
         tables.append(table)
-        parts.append(_points_of_isis(isis_points, path, given_ids))
+        parts.append(_points_of_isis(isis_points, path, existing_ids))
         if unknown:
             warnings.append(
                 f"{path}: measurements in images that are not in [images]: {list_some(unknown, 3)}"
                 "; of serial numbers give [serial_numbers]"
             )
     if "tie_points" in section:
-        given_ids = {id for part in parts for id in part.id}
+        existing_ids = {id for part in parts for id in part.id}
         measured: set[tuple[object, ...]] = set()
         for path in section.paths("tie_points", "a CSV table of measurements of tie points"):
             table = read_csv(path)
             table.check_names(MEASURED[:4], MEASURED[4:])
             tables.append(_without_repeated(table, measured))
-            new = [id for id in dict.fromkeys(table.values["point"]) if id not in given_ids]
-            given_ids |= set(new)
-            parts.append(_tie_points(new, Source(str(path))))
+            new_ids = [id for id in dict.fromkeys(table.values["point"]) if id not in existing_ids]
+            existing_ids |= set(new_ids)
+            parts.append(_tie_points(new_ids, Source(str(path))))
     points = _join_points(parts)
     # Checked first: the ids of observations are looked up in it.
     check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
     if frames is not None:
         # Points that only photographs show follow those of the table.
-        frame_ids = (id for id in frames.points.id if id not in ids)
-        ids |= {id: k for k, id in enumerate(frame_ids, len(ids))}
+        photo_point_ids = (id for id in frames.points.id if id not in ids)
+        ids |= {id: k for k, id in enumerate(photo_point_ids, len(ids))}
     image_ids = [image.id for image in images]
     table = _join_tables(tables)
     return points, _observations(table, ids, image_ids, section, points.source.name), warnings
 
 
-def _without_repeated(table: Columns, known_rows: set[tuple[object, ...]]) -> Columns:
-    """A table of tie points without the measurements that an earlier one has, `known_rows`: a
-    corner of an image is the same measurement in the tables of all its pairs. These are added to
-    `known_rows`."""
+def _without_repeated(table: Columns, measured: set[tuple[object, ...]]) -> Columns:
+    """A table of tie points without the measurements of earlier ones, `measured`: a corner
+    of an image is the same measurement in the tables of all its pairs. These are added to
+    `measured`."""
     rows = list(zip(*(table.values[name] for name in MEASURED[:4])))
-    new_rows = np.array([k for k, row in enumerate(rows) if row not in known_rows], int)
-    known_rows |= set(rows)
+    new_rows = np.array([k for k, row in enumerate(rows) if row not in measured], int)
+    measured |= set(rows)
     if len(new_rows) == len(rows):
         return table
     values = {name: [column[k] for k in new_rows] for name, column in table.values.items()}
@@ -123,7 +125,7 @@ def _control_points(control: ControlFile, path: Path, earth: Ellipsoid | None) -
             f"{path}: longitudes need an ellipsoid of revolution as [scanner] earth; give X, Y, Z "
             "in a CSV table"
         )
-    longitude, latitude, height = control.place.T
+    longitude, latitude, height = control.geographic.T
     ground = np.radians(longitude), np.radians(latitude), height
     X = np.stack([np.asarray(v) for v in earth_fixed(earth, ground)], 1)
     source = Source(str(path), control.row, "line")
@@ -143,23 +145,23 @@ def _measured_control(
     """The measurements of a `.gcp` file as a table, and its images that nobody knows, in words."""
     images = [names.get(name) or names.get(Path(name).stem) for name in control.image]
     unknown = {name for name, id in zip(control.image, images) if id is None}
-    known_rows = np.array([k for k, id in enumerate(images) if id is not None], int)
-    point = control.point[known_rows]
+    used_rows = np.array([k for k, id in enumerate(images) if id is not None], int)
+    point = control.point[used_rows]
     values = {
-        "image": [images[k] for k in known_rows],
+        "image": [images[k] for k in used_rows],
         "point": [control.id[p] for p in point],
-        **dict(zip(("line", "pixel"), control.xy[known_rows].T.tolist())),
-        **dict(zip(("sline", "spixel"), control.xy_sigma[known_rows].T.tolist())),
+        **dict(zip(("line", "pixel"), control.xy[used_rows].T.tolist())),
+        **dict(zip(("sline", "spixel"), control.xy_sigma[used_rows].T.tolist())),
     }
     return Columns(values, Source(str(path), control.row[point], "line")), ", ".join(
         sorted(unknown)
     )
 
 
-def _points_of_isis(isis_points: IsisPoints, path: Path, given_ids: set[str]) -> GroundPoints:
+def _points_of_isis(isis_points: IsisPoints, path: Path, existing_ids: set[str]) -> GroundPoints:
     """The points of a file of ISIS that are not given otherwise: σ along the axes of each one's
     covariance."""
-    new_rows = np.array([k for k, id in enumerate(isis_points.id) if id not in given_ids], int)
+    new_rows = np.array([k for k, id in enumerate(isis_points.id) if id not in existing_ids], int)
     variances, vectors = np.linalg.eigh(isis_points.covariance[new_rows])
     X = isis_points.X[new_rows].copy()
     roles = [isis_points.role[k] for k in new_rows]
@@ -181,52 +183,54 @@ def _measured_by_isis(
 ) -> tuple[Columns, list[str]]:
     """The measurements of a file of ISIS as a table, and its images that nobody knows."""
     images = [
-        next((names[n] for n in serials if n in names), None) for serials in isis_points.image
+        next((names[n] for n in image_names if n in names), None)
+        for image_names in isis_points.image
     ]
-    unknown = sorted({serials[0] for serials, id in zip(isis_points.image, images) if id is None})
-    known_rows = np.array([k for k, id in enumerate(images) if id is not None], int)
+    unknown = sorted(
+        {image_names[0] for image_names, id in zip(isis_points.image, images) if id is None}
+    )
+    used_rows = np.array([k for k, id in enumerate(images) if id is not None], int)
     sigma = [
-        [None if np.isnan(v) else v for v in isis_points.xy_sigma[known_rows, k].tolist()]
+        [None if np.isnan(v) else v for v in isis_points.xy_sigma[used_rows, k].tolist()]
         for k in (0, 1)
     ]
     values = {
-        "image": [images[k] for k in known_rows],
-        "point": [isis_points.id[p] for p in isis_points.point[known_rows]],
-        **dict(zip(("line", "pixel"), isis_points.xy[known_rows].T.tolist())),
+        "image": [images[k] for k in used_rows],
+        "point": [isis_points.id[p] for p in isis_points.point[used_rows]],
+        **dict(zip(("line", "pixel"), isis_points.xy[used_rows].T.tolist())),
         **dict(zip(("sline", "spixel"), sigma)),
     }
     table = Columns(
-        values, Source(str(path), isis_points.ray_row[known_rows], "line"), may_be_empty=True
+        values, Source(str(path), isis_points.ray_row[used_rows], "line"), may_be_empty=True
     )
     return table, unknown
 
 
-def _matched(
+def _matched_points(
     files: Sequence[Path], names: Mapping[str, str], ids: Sequence[str]
 ) -> tuple[Columns, GroundPoints, list[str]]:
     """The tie points of `.match` files: their measurements, themselves, and warnings."""
-    pairs, index_of = [], {id: k for k, id in enumerate(ids)}
+    pairs, image_index = [], {id: k for k, id in enumerate(ids)}
     for path in files:
         first_image, second_image = (
-            index_of[names[name]] for name in images_of_match(path, list(names))
+            image_index[names[name]] for name in images_of_match(path, list(names))
         )
         pairs.append((first_image, second_image, *read_match(path)))
-    joined_matches = join_matches(pairs)
-    number = int(joined_matches.point.max(initial=-1)) + 1
+    tracks = join_matches(pairs)
+    number = int(tracks.point.max(initial=-1)) + 1
     labels = [f"M{k + 1}" for k in range(number)]
     values = {
-        "image": [ids[i] for i in joined_matches.image],
-        "point": [labels[p] for p in joined_matches.point],
-        **dict(zip(("line", "pixel"), joined_matches.xy.T.tolist())),
+        "image": [ids[i] for i in tracks.image],
+        "point": [labels[p] for p in tracks.point],
+        **dict(zip(("line", "pixel"), tracks.xy.T.tolist())),
     }
     source = Source("match files")
     ties = _tie_points(labels, source)
     warnings = []
-    if joined_matches.contradicting:
+    if tracks.contradicting:
         warnings.append(
-            f"match files: {count(joined_matches.contradicting, 'tie point')} with two places in "
-            "one image, "
-            "left out"
+            f"match files: {count(tracks.contradicting, 'tie point')} with two places in one "
+            "image, left out"
         )
     return Columns(values, source), ties, warnings
 
@@ -250,13 +254,13 @@ def _join_points(parts: Sequence[GroundPoints]) -> GroundPoints:
             f"{files}: σ of control points are along X, Y, Z in one and along east, north, up in "
             "another; give all along the same axes"
         )
-    join = lambda name: np.concatenate([getattr(part, name) for part in parts])
+    concatenate = lambda name: np.concatenate([getattr(part, name) for part in parts])
     return GroundPoints(
         tuple(id for part in parts for id in part.id),
         tuple(role for part in parts for role in part.role),
-        join("X"),
-        join("sigma"),
-        join("axes"),
+        concatenate("X"),
+        concatenate("sigma"),
+        concatenate("axes"),
         axes.pop() if axes else parts[0].axis_names,
         _join_sources([(part.source, len(part)) for part in parts], "points"),
     )
@@ -277,12 +281,12 @@ def _join_tables(tables: Sequence[Columns]) -> Columns:
 
 def _join_sources(sources: Sequence[tuple[Source, int]], name: str) -> Source:
     """The source of rows of several sources."""
-    places = [
+    row_names = [
         f"{n + 1 if source.numbers is None else source.numbers[n]} of {source.name}"
         for source, number in sources
         for n in range(number)
     ]
-    return Source(name, np.array(places, object), sources[0][0].word)
+    return Source(name, np.array(row_names, object), sources[0][0].word)
 
 
 def _points_of(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPoints:
@@ -336,13 +340,13 @@ def _observations(
     where_points: str,
 ) -> Observations:
     table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
-    sigma, is_stated = section.number("sigma", 1.0), "sigma" in section.values
+    sigma, has_sigma = section.number("sigma", 1.0), "sigma" in section.values
     if sigma <= 0:
         raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
     stated_sigma = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
-    lacking = np.isnan(stated_sigma)
-    if not is_stated and lacking.any() and not lacking.all():
-        row = int(lacking.any(1).argmax())
+    is_missing = np.isnan(stated_sigma)
+    if not has_sigma and is_missing.any() and not is_missing.all():
+        row = int(is_missing.any(1).argmax())
         raise InputError(
             f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
             f"sigma in [refine] for those without"
@@ -351,7 +355,7 @@ def _observations(
         table.indices("image", "image", {id: k for k, id in enumerate(images)}, section.where),
         table.indices("point", "point", ids, where_points),
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
-        np.where(lacking, sigma, stated_sigma),
+        np.where(is_missing, sigma, stated_sigma),
         table.source,
-        STATED if is_stated or not lacking.any() else UNIT,
+        STATED if has_sigma or not is_missing.any() else UNIT,
     )

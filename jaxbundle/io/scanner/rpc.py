@@ -123,8 +123,8 @@ def read_rpc(path: str | Path, unknown: UnknownKeys | None = None) -> Rpc:
         elif "line_num_coeff_00" in text or path.suffix.lower() == ".geom":
             values = from_geom(path, text)
         else:
-            read_values = _from_rpb if "lineOffset" in text else _from_text
-            values = read_values(path, text, unknown)
+            reader = _from_rpb if "lineOffset" in text else _from_text
+            values = reader(path, text, unknown)
     for axis in OFFSETS:
         if values[f"{axis}_scale"] == 0:
             raise InputError(f"{path}: the scale of {axis} is 0; expected another number")
@@ -145,16 +145,14 @@ def read_stated_errors(path: str | Path) -> StatedErrors:
     if path.suffix.lower() in RASTERS:
         with open_raster(path) as source, foreign_parser(f"{path}: its RPC", "those of a raster"):
             tags = source.rpcs
-        stated_words = {name: getattr(tags, f"err_{name[:4]}", None) for name in ERRORS}
+        texts = {name: getattr(tags, f"err_{name[:4]}", None) for name in ERRORS}
     else:
         text = read_text(path, fallback="latin-1")
         matches = {name: pattern.search(text) for name, pattern in ERRORS.items()}
-        stated_words = {name: match and match[1] for name, match in matches.items()}
+        texts = {name: match and match[1] for name, match in matches.items()}
     # A negative number stands for an unknown one in RPC00B.
     number = lambda word: max(number_in(str(word), f"{path}: its stated error"), 0.0)
-    return StatedErrors(
-        **{name: number(word) for name, word in stated_words.items() if word is not None}
-    )
+    return StatedErrors(**{name: number(word) for name, word in texts.items() if word is not None})
 
 
 def write_rpc(path: str | Path, rpc: Rpc) -> None:
@@ -183,13 +181,13 @@ def _from_text(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
                 f"{path}, line {number}: {show(line.strip())}; expected NAME: value, such as "
                 "LINE_OFF: 3000.5"
             )
-        key_as_written, name = name.strip(), name.strip().upper()
+        spelling, name = name.strip(), name.strip().upper()
         if name in entries:
             raise InputError(f"{path}, line {number}: {name} occurs twice")
         entries[name] = value.split(), number
         # As it is written: capitals show where the words of an unknown name begin.
         if TEXT_KEYS.unknown((name,)):
-            unknown.check((key_as_written,), TEXT_KEYS, f"{path}, line {number}")
+            unknown.check((spelling,), TEXT_KEYS, f"{path}, line {number}")
 
     def number_of(name: str, unit: str | None = None) -> float:
         if name not in entries:

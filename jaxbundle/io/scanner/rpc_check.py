@@ -45,8 +45,10 @@ def check_against_rpc(
     if file is None:
         if not expected:
             return scanner
-        usual = _names(scanner.image.corrections)
-        return _warn(scanner, f"{path}: has no RPC that could choose corrections: {usual} applied")
+        applied = _describe_corrections(scanner.image.corrections)
+        return _warn(
+            scanner, f"{path}: has no RPC that could choose corrections: {applied} applied"
+        )
     try:
         unknown = UnknownKeys()
         rpc = read_rpc(file, unknown)
@@ -64,39 +66,41 @@ def check_against_rpc(
         return _warn(scanner, f"{path}: no position could be compared with the RPC of {file.name}")
     agreements = _compare(image, rpc, CORRECTION_SETS)
     best = min(range(len(agreements)), key=lambda k: np.nan_to_num(agreements[k].rms, nan=np.inf))
-    chosen_corrections = CORRECTION_SETS[best]
+    best_set = CORRECTION_SETS[best]
     if _agree(agreements[best], random_error):
         if choose:
             message = (
-                f"{path}: {_names(chosen_corrections)} applied, with which the rigorous model "
-                "agrees with the "
-                f"RPC of {file.name} ({_size(agreements[best])}); with those usual for this "
-                "product, "
-                f"{_names(image.corrections)}, it does not ({_size(usual)}). [corrections] in a "
-                "scanner file sets others"
+                f"{path}: {_describe_corrections(best_set)} applied, with which the rigorous "
+                f"model agrees with the RPC of {file.name} ({_describe_size(agreements[best])}); "
+                f"with those usual for this product, {_describe_corrections(image.corrections)}, "
+                f"it does not ({_describe_size(usual)}). [corrections] in a scanner file sets "
+                "others"
             )
-            image = dataclasses.replace(image, corrections=chosen_corrections)
-            chosen_one = dataclasses.replace(scanner, image=image, agreement=agreements[best])
-            return _warn(chosen_one, message)
+            image = dataclasses.replace(image, corrections=best_set)
+            corrected_scanner = dataclasses.replace(
+                scanner, image=image, agreement=agreements[best]
+            )
+            return _warn(corrected_scanner, message)
         remedy = (
-            f"With {_names(chosen_corrections)} they agree ({_size(agreements[best])}): set "
-            "[corrections] so"
+            f"With {_describe_corrections(best_set)} they agree "
+            f"({_describe_size(agreements[best])}): set [corrections] so"
         )
     else:
-        remark = "; others leave more"
-        if chosen_corrections != image.corrections:
-            remark = (
-                f"; the smallest difference, with {_names(chosen_corrections)}, is "
-                f"{_size(agreements[best])}"
+        comparison = "; others leave more"
+        if best_set != image.corrections:
+            comparison = (
+                f"; the smallest difference, with {_describe_corrections(best_set)}, is "
+                f"{_describe_size(agreements[best])}"
             )
         remedy = (
-            f"No corrections explain it{remark}. Check the origin of lines and pixels and whether "
-            "the RPC are of this image, or use the RPC"
+            f"No corrections explain it{comparison}. Check the origin of lines and pixels and "
+            "whether the RPC are of this image, or use the RPC"
         )
     return _warn(
         scanner,
-        f"{path}: the rigorous model, with {_names(image.corrections)}, and the RPC of {file.name} "
-        f"differ by more than their accuracy explains: {_size(usual)}. {remedy}",
+        f"{path}: the rigorous model, with {_describe_corrections(image.corrections)}, and the "
+        f"RPC of {file.name} differ by more than their accuracy explains: "
+        f"{_describe_size(usual)}. {remedy}",
     )
 
 
@@ -133,18 +137,18 @@ def _agree(agreement: Agreement, random_error: float) -> bool:
     return agreement.rms_pixels <= SUBPIXEL or agreement.rms <= np.sqrt(2) * random_error
 
 
-def _size(agreement: Agreement) -> str:
+def _describe_size(agreement: Agreement) -> str:
     return (
-        f"{agreement.rms:.2g} m RMS, {agreement.rms_pixels:.2g} pixel; {agreement.largest:.2g} m "
-        "at most"
+        f"{agreement.rms:.2g} m RMS, {agreement.rms_pixels:.2g} pixel; "
+        f"{agreement.largest:.2g} m at most"
     )
 
 
-def _names(corrections: Corrections) -> str:
-    names_on = [name.replace("_", " ") for name, is_on in corrections._asdict().items() if is_on]
-    if not names_on:
+def _describe_corrections(corrections: Corrections) -> str:
+    applied = [name.replace("_", " ") for name, is_on in corrections._asdict().items() if is_on]
+    if not applied:
         return "no correction"
-    return names_on[0] if len(names_on) == 1 else f"{', '.join(names_on[:-1])} and {names_on[-1]}"
+    return applied[0] if len(applied) == 1 else f"{', '.join(applied[:-1])} and {applied[-1]}"
 
 
 def _warn(scanner: ScannerInput, message: str) -> ScannerInput:

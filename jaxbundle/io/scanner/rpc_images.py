@@ -18,7 +18,7 @@ from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.io.text.xml_fields import read_xml
 from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
-from jaxbundle.system.file_content import missing
+from jaxbundle.system.file_content import no_such_file
 from jaxbundle.system.rasters import check_raw, open_raster
 
 IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
@@ -43,9 +43,13 @@ def has_rpc_only(path: Path) -> bool:
     if suffix != ".xml":
         return suffix in (*IMAGES, *COEFFICIENTS)
     root = read_xml(path)
-    has = lambda key: root.find(f".//{key}") is not None
-    rigorous = has("EPH") and has("ATT") if has("RPB") else has("Refined_Model")
-    return not rigorous and (has("RPB") or has("Rational_Function_Model"))
+    has_element = lambda key: root.find(f".//{key}") is not None
+    rigorous = (
+        has_element("EPH") and has_element("ATT")
+        if has_element("RPB")
+        else has_element("Refined_Model")
+    )
+    return not rigorous and (has_element("RPB") or has_element("Rational_Function_Model"))
 
 
 def read_rpc_image(path: Path, raster: Path | None = None) -> RpcInput:
@@ -55,21 +59,21 @@ def read_rpc_image(path: Path, raster: Path | None = None) -> RpcInput:
 
     **Raises:** `InputError`, also for a raster that is a map.
     """
-    source, beside = find_coefficients(path), raster or find_raster(path)
+    source, raster_path = find_coefficients(path), raster or find_raster(path)
     unknown = UnknownKeys()
     rpc = read_rpc(source, unknown)
-    if beside is None:
+    if raster_path is None:
         lines, pixels = _domain_size(rpc)
         image = RpcImage(rpc, lines, pixels, sized=False)
         return RpcInput(path.stem, image, warnings=unknown.messages())
-    with open_raster(beside) as bands:
+    with open_raster(raster_path) as bands:
         # Tags belong to the pixels of their raster, also of a map or of a part; a file of
         # coefficients to the whole image.
-        if source != beside and bands.crs is None:
-            check_raw(beside, bands)
+        if source != raster_path and bands.crs is None:
+            check_raw(raster_path, bands)
         size = bands.height, bands.width
-    messages = () if source == beside else _other_size(source, beside, rpc, size)
-    return RpcInput(path.stem, RpcImage(rpc, *size), warnings=(*unknown.messages(), *messages))
+    size_warnings = () if source == raster_path else _size_warnings(source, raster_path, rpc, size)
+    return RpcInput(path.stem, RpcImage(rpc, *size), warnings=(*unknown.messages(), *size_warnings))
 
 
 def find_coefficients(path: Path) -> Path:
@@ -79,11 +83,11 @@ def find_coefficients(path: Path) -> Path:
     tags.
     """
     if not path.is_file():
-        raise missing(path, "a raster with RPC, or a file of coefficients")
+        raise no_such_file(path, "a raster with RPC, or a file of coefficients")
     if path.suffix.lower() not in IMAGES:
         return path
-    beside = (path.with_name(path.stem + end) for end in COMPANION_ENDINGS)
-    coefficients_file = next((p for p in beside if p.is_file()), path)
+    companions = (path.with_name(path.stem + end) for end in COMPANION_ENDINGS)
+    coefficients_file = next((p for p in companions if p.is_file()), path)
     if coefficients_file is path and path.suffix.lower() not in RASTERS:
         raise InputError(f"{path}: no coefficients beside it: expected {path.stem}_RPC.TXT")
     return coefficients_file
@@ -98,11 +102,11 @@ def find_raster(path: Path, *folders: Path) -> Path | None:
     for end in ENDINGS:
         stem = stem.removesuffix(end)
     names = [stem + suffix for suffix in (*IMAGES, *(s.upper() for s in IMAGES))]
-    places = (place / name for place in (path.parent, *folders) for name in names)
-    return next((p for p in places if p.is_file()), None)
+    candidates = (folder / name for folder in (path.parent, *folders) for name in names)
+    return next((p for p in candidates if p.is_file()), None)
 
 
-def _other_size(source: Path, raster: Path, rpc: Rpc, size: tuple[int, int]) -> tuple[str, ...]:
+def _size_warnings(source: Path, raster: Path, rpc: Rpc, size: tuple[int, int]) -> tuple[str, ...]:
     """Whether coefficients may belong to another raster, such as the whole image of a tile."""
     domain_size = _domain_size(rpc)
     # Vendors' domains end within a tenth of the image; a tile is half of it or less.
@@ -110,8 +114,8 @@ def _other_size(source: Path, raster: Path, rpc: Rpc, size: tuple[int, int]) -> 
         return ()
     return (
         f"{source} holds for {domain_size[0]} lines of {domain_size[1]} pixels, {raster} has "
-        f"{size[0]} of "
-        f"{size[1]}: is it a tile or a part of a larger image? Coefficients refer to the whole",
+        f"{size[0]} of {size[1]}: is it a tile or a part of a larger image? Coefficients refer to "
+        "the whole",
     )
 
 

@@ -119,16 +119,13 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
 
     **Raises:** `InputError` naming file, line and keyword.
     """
-    keywords = {}
+    entries = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, value = line.partition(":")
         if colon:
             # Keywords may be prefixed by the image or the projection.
-            keywords[name.strip()] = keywords[name.strip().rpartition(".")[2]] = (
-                value.strip(),
-                number,
-            )
-    kind, line = keywords.get("polynomial_format", ("B", 0))
+            entries[name.strip()] = entries[name.strip().rpartition(".")[2]] = value.strip(), number
+    kind, line = entries.get("polynomial_format", ("B", 0))
     if kind != "B":
         raise InputError(
             f"{path}, line {line}: polynomial_format is {show(kind)}; only B is read, whose terms "
@@ -136,46 +133,45 @@ def from_geom(path: Path, text: str) -> dict[str, Any]:
         )
     adjusted = [
         name
-        for name, (value, _) in keywords.items()
+        for name, (value, _) in entries.items()
         if ".adj_param_" in name
         and name.endswith(".parameter")
         and value not in ("0", "0.0")
-        and number_of(path, keywords, name) != 0
+        and number_of(path, entries, name) != 0
     ]
     if adjusted:
         raise InputError(
-            f"{path}, line {keywords[adjusted[0]][1]}: the adjustable parameter {adjusted[0]} is "
-            "not "
-            "0; adjusted models are not read"
+            f"{path}, line {entries[adjusted[0]][1]}: the adjustable parameter {adjusted[0]} is "
+            "not 0; adjusted models are not read"
         )
     values: dict[str, Any] = {}
     for axis, name in AXES.items():
-        values[f"{axis}_offset"] = number_of(path, keywords, f"{name}_off")
-        values[f"{axis}_scale"] = number_of(path, keywords, f"{name}_scale")
+        values[f"{axis}_offset"] = number_of(path, entries, f"{name}_off")
+        values[f"{axis}_scale"] = number_of(path, entries, f"{name}_scale")
     for field, (axis, part) in FIELDS.items():
         names = [f"{axis}_{part}_coeff_{k:02d}" for k in range(TERMS)]
-        values[field] = [number_of(path, keywords, name) for name in names]
+        values[field] = [number_of(path, entries, name) for name in names]
     return values
 
 
-def number_of(path: Path, keywords: dict[str, tuple[str, int]], name: str) -> float:
+def number_of(path: Path, entries: dict[str, tuple[str, int]], name: str) -> float:
     """The number of a keyword."""
-    if name not in keywords:
+    if name not in entries:
         raise InputError(f"{path}: {name} is missing; expected a keyword list of an OSSIM RPC")
-    value, line = keywords[name]
+    value, line = entries[name]
     return number_in(value, f"{path}, line {line}: {name}")
 
 
 def _from_dimap(file: XmlFields, root: ET.Element, unknown: UnknownKeys) -> dict[str, Any]:
     inverse = next((n for n in DIMAP_OTHER if file.find(n) is not None), None)
     if inverse is None:
-        raise file.missing("Inverse_Model")
+        raise file.missing_error("Inverse_Model")
     for name in ("RFM_Validity", inverse):
         unknown.check_element(not_none(root.find(f".//{name}")), DIMAP_KEYS, f"{file.path}: {name}")
     values = {}
     for axis, name in AXES.items():
-        for part, short in (("offset", "OFF"), ("scale", "SCALE")):
-            values[f"{axis}_{part}"] = file.number(f"RFM_Validity/{name.upper()}_{short}")
+        for part, suffix in (("offset", "OFF"), ("scale", "SCALE")):
+            values[f"{axis}_{part}"] = file.number(f"RFM_Validity/{name.upper()}_{suffix}")
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
     for axis in ("line", "sample"):
         # The first pixel is (1, 1) or (0, 0) by the profile of the product.

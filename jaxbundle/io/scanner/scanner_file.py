@@ -216,11 +216,11 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
 
 
-def _frame(section: TomlSection, earth: Ellipsoid | None, known_frames: Sequence[str]) -> str:
+def _frame(section: TomlSection, earth: Ellipsoid | None, allowed_frames: Sequence[str]) -> str:
     frame = section.text("frame", "local" if earth is None else "ITRF")
-    if frame not in known_frames:
+    if frame not in allowed_frames:
         raise InputError(
-            f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known_frames)}"
+            f"{section.where}unknown frame {frame!r}{did_you_mean(frame, allowed_frames)}"
         )
     # Attitudes against the orbit are given without an Earth, too.
     if (earth is None) != (frame == "local") and frame != "orbit":
@@ -259,14 +259,13 @@ def _check_outside(P: Float[np.ndarray, "n 3"], earth: Ellipsoid, source: Source
     """Refuse positions deep inside the Earth, such as in kilometres."""
     distance = np.linalg.norm(P, axis=1)
     # A hundredth of the axis, 64 km: no camera is so deep.
-    smallest_distance = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
-    if (bad := distance < smallest_distance).any():
-        row = int(bad.argmax())
+    min_distance = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
+    if (is_too_deep := distance < min_distance).any():
+        row = int(is_too_deep.argmax())
         raise InputError(
             f"{source(row)}: the position is {distance[row]:.6g} m from the centre of the Earth, "
-            f"whose axes are {smallest_distance / 0.99:.7g} m and more; expected metres from the "
-            "centre: is it "
-            "in kilometres, or in another frame?"
+            f"whose axes are {min_distance / 0.99:.7g} m and more; expected metres from the "
+            "centre: is it in kilometres, or in another frame?"
         )
 
 
@@ -359,12 +358,12 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
         return AngleTable(*(jnp.asarray(a) for a in angles))
     if "across" in section:
         section.check_keys(("across", "along", "middle", "half"))
-        half_width = section.number("half", pixels / 2)
+        half = section.number("half", pixels / 2)
         return AnglePolynomial(
             jnp.asarray(section.numbers("across")),
             jnp.asarray(section.numbers("along")),
             jnp.asarray(middle),
-            jnp.asarray(half_width),
+            jnp.asarray(half),
         )
     try:
         model = get_model(section.text("model", "brown"))

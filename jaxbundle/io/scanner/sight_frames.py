@@ -12,10 +12,10 @@ from jaxbundle.pushbroom.scanner import AnglePolynomial
 
 
 class SightFrame(NamedTuple):
-    """`turn` leads from our camera frame into that of the product, `slopes` from its x/z, y/z to
-    (ξ, η)."""
+    """`rotation` leads from our camera frame into that of the product, `slopes` from its x/z, y/z
+    to (ξ, η)."""
 
-    turn: Rotation
+    rotation: Rotation
     slopes: Callable[[Float[np.ndarray, " n"], Float[np.ndarray, " n"]], Float[np.ndarray, "2 n"]]
 
 
@@ -31,24 +31,24 @@ def sight_frame(
     """
     look = np.array([*sights[:, sights.shape[1] // 2], 1.0])
     # The camera frame here looks along −z: rotated about x, or unchanged and seen from behind.
-    is_ahead = look @ down > 0
-    turn = Rotation.from_matrix(np.diag([1.0, -1, -1]) if is_ahead else np.eye(3))
-    signs = np.array([1.0, -1.0]) if is_ahead else np.array([-1.0, -1.0])
+    looks_along_z = look @ down > 0
+    rotation = Rotation.from_matrix(np.diag([1.0, -1, -1]) if looks_along_z else np.eye(3))
+    signs = np.array([1.0, -1.0]) if looks_along_z else np.array([-1.0, -1.0])
     line_direction = signs * (sights[:, -1] - sights[:, 0])
     angle = np.arctan2(line_direction[1], line_direction[0])
-    about = lambda angle: turn * Rotation.from_rotvec([0, 0, angle])
-    if about(angle).inv().apply(forward)[1] < 0:  # y would point backwards
+    rotation_about = lambda angle: rotation * Rotation.from_rotvec([0, 0, angle])
+    if rotation_about(angle).inv().apply(forward)[1] < 0:  # y would point backwards
         angle += np.pi
     c, s = np.cos(angle), np.sin(angle)
     slopes = lambda x, y: np.array([[c, s], [-s, c]]) @ (signs[:, None] * [x, y])
-    return SightFrame(about(angle), slopes)
+    return SightFrame(rotation_about(angle), slopes)
 
 
 def polynomial_optics(
     frame: SightFrame, x: Float[np.ndarray, " k"], y: Float[np.ndarray, " k"]
 ) -> AnglePolynomial:
     """The optics of x/z and y/z that are polynomials of the pixel, constants first."""
-    slope_across, slope_along = frame.slopes(np.asarray(x, float), np.asarray(y, float))
+    across, along = frame.slopes(np.asarray(x, float), np.asarray(y, float))
     return AnglePolynomial(
-        jnp.asarray(slope_across), jnp.asarray(slope_along), jnp.asarray(0.0), jnp.asarray(1.0)
+        jnp.asarray(across), jnp.asarray(along), jnp.asarray(0.0), jnp.asarray(1.0)
     )

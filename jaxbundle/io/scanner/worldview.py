@@ -150,13 +150,15 @@ def read_worldview(file: XmlFields) -> ScannerInput:
     # Of a row are used: index, position, velocity; index, quaternion. Covariances follow.
     t, P, _ = _table(file, "EPH", "EPHEMLIST", 7, epoch)
     rows, values, source = _table(file, "ATT", "ATTLIST", 5, epoch)
-    values, lengths = normalise_quaternions(values, source)
+    values, length_warnings = normalise_quaternions(values, source)
     R = Rotation.from_quat(values)
     centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
     # Ephemerides are those of the satellite, lines of sight begin in its camera.
     P = P[:, :3] + slerp(rows, R, t).apply(centre)
     lens = np.array([file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)])
-    (lens,), odd = normalise_quaternions(lens[None], Source(f"{path}, QCS1 to QCS4", None, "row"))
+    (lens,), lens_warnings = normalise_quaternions(
+        lens[None], Source(f"{path}, QCS1 to QCS4", None, "row")
+    )
     x, y, warnings = _detectors(file)
     tables = Tables(
         t, P, rows, R * Rotation.from_quat(lens), Source(f"{path}, EPHEMLIST", None, "row"), source
@@ -164,8 +166,8 @@ def read_worldview(file: XmlFields) -> ScannerInput:
     u = np.arange(pixels)
     down, forward = tables.directions(float(times.time((lines - 1) / 2)))
     frame = sight_frame(np.stack([np.polyval(p[::-1], u) for p in (x, y)]), down, forward)
-    when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
-    trajectory, messages = trajectory_of(tables, frame.turn, when)
+    line_times = np.asarray(times.time(jnp.arange(lines, dtype=float)))
+    trajectory, trajectory_warnings = trajectory_of(tables, frame.rotation, line_times)
     image = make_image(
         trajectory,
         times,
@@ -177,7 +179,10 @@ def read_worldview(file: XmlFields) -> ScannerInput:
     )
     name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
     return ScannerInput(
-        name, image, WGS84, (*lengths, *odd, *warnings, *messages, *unknown.messages())
+        name,
+        image,
+        WGS84,
+        (*length_warnings, *lens_warnings, *warnings, *trajectory_warnings, *unknown.messages()),
     )
 
 
@@ -212,12 +217,12 @@ def _line_times(file: XmlFields, lines: int) -> LineTimes:
 
 
 def _table(
-    file: XmlFields, group: str, name: str, number_used: int, epoch: np.datetime64
+    file: XmlFields, group: str, name: str, value_count: int, epoch: np.datetime64
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows n"], Source]:
     """Seconds since the epoch, the values of the rows, and the source of the table."""
     rows = file.elements(f"{group}/{name}List/{name}")
     values = np.array(
-        [_numbers(file, e, f"{name} {k}", number_used) for k, e in enumerate(rows, 1)]
+        [_numbers(file, e, f"{name} {k}", value_count) for k, e in enumerate(rows, 1)]
     )
     start = seconds(file.time(f"{group}/STARTTIME"), epoch)
     t = start + file.number(f"{group}/TIMEINTERVAL") * (values[:, 0] - 1)
@@ -228,12 +233,12 @@ def _table(
     return t, values[:, 1:], source
 
 
-def _numbers(file: XmlFields, element: ET.Element, name: str, number_used: int) -> list[float]:
+def _numbers(file: XmlFields, element: ET.Element, name: str, value_count: int) -> list[float]:
     """The first numbers of an element with more numbers."""
     words = (element.text or "").replace(",", " ").split()
-    if len(words) < number_used:
-        raise InputError(f"{file.path}: {name} has {len(words)} numbers; expected {number_used}")
-    return [number_in(word, f"{file.path}: {name}") for word in words[:number_used]]
+    if len(words) < value_count:
+        raise InputError(f"{file.path}: {name} has {len(words)} numbers; expected {value_count}")
+    return [number_in(word, f"{file.path}: {name}") for word in words[:value_count]]
 
 
 def _detectors(
@@ -249,7 +254,7 @@ def _detectors(
     mounting = file.find("GEO/DETECTOR_MOUNTING")
     bands = [] if mounting is None else [b for b in mounting if b.tag.startswith("BAND_")]
     if not bands:
-        raise file.missing("GEO/DETECTOR_MOUNTING/BAND_")
+        raise file.missing_error("GEO/DETECTOR_MOUNTING/BAND_")
     names = ("DETORIGINX", "DETORIGINY", "DETROTANGLE", "DETPITCH")
     values = [
         [
@@ -262,14 +267,13 @@ def _detectors(
     c = file.number("GEO/PRINCIPAL_DISTANCE/PD")
     if c == 0 or pitch == 0:
         raise InputError(f"{file.path}: PD and DETPITCH must not be 0, in millimetres")
-    differing_bands = [band.tag for band, v in zip(bands, values) if v != values[0]]
+    other_bands = [band.tag for band, v in zip(bands, values) if v != values[0]]
     warnings = (
         ()
-        if not differing_bands
+        if not other_bands
         else (
-            f"{file.path}: the detectors of {', '.join(differing_bands)} differ in position from "
-            "those of "
-            f"{bands[0].tag}, which are used",
+            f"{file.path}: the detectors of {', '.join(other_bands)} differ in position from "
+            f"those of {bands[0].tag}, which are used",
         )
     )
     direction = pitch * np.array([np.sin(np.radians(angle)), -np.cos(np.radians(angle))])

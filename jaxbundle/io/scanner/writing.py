@@ -102,8 +102,8 @@ def _optics(
 ) -> dict[str, Any]:
     if isinstance(optics, FocalLine):
         parameters = dict(zip(get_model(optics.model).parameters, optics.parameters.tolist()))
-        placement = {k: float(getattr(optics, k)) for k in ("pitch", "middle", "row")}
-        return {"model": optics.model, **parameters, **placement}
+        line_fields = {k: float(getattr(optics, k)) for k in ("pitch", "middle", "row")}
+        return {"model": optics.model, **parameters, **line_fields}
     if isinstance(optics, AnglePolynomial):
         return {
             "across": optics.across.tolist(),

@@ -69,10 +69,12 @@ def open_archive(
             raise InputError(
                 f"{path}: is not {expected}, or is damaged: {foreign[0]!r} is no array of NumPy"
             )
-        if odd := [name for name, info in infos.items() if info.compress_type not in METHODS]:
+        if unreadable_names := [
+            name for name, info in infos.items() if info.compress_type not in METHODS
+        ]:
             raise InputError(
-                f"{path}: the array {odd[0]!r} is packed in a way that numpy.savez does not use; "
-                "write it with numpy.savez or numpy.savez_compressed"
+                f"{path}: the array {unreadable_names[0]!r} is packed in a way that numpy.savez "
+                "does not use; write it with numpy.savez or numpy.savez_compressed"
             )
         unpacked = sum(info.file_size for info in infos.values())
         if unpacked > largest_unpacked_size(size):

@@ -85,7 +85,9 @@ def parse_csv(path: Path, text: str) -> Columns:
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a table for `read_csv`; floats in full precision."""
-    write_text(path, (_csv_text(some) for some in take_portions(itertools.chain((header,), rows))))
+    write_text(
+        path, (_csv_text(portion) for portion in take_portions(itertools.chain((header,), rows)))
+    )
 
 
 def _csv_text(rows: Iterable[Sequence[Any]]) -> str:
@@ -111,8 +113,8 @@ def take_portions(rows: Iterable[T], portion: int = 10_000) -> Iterator[list[T]]
     """Rows some at a time, for conversion to text: `portion` of them are some megabytes; not
     critical."""
     rows = iter(rows)
-    while portion_of_rows := list(itertools.islice(rows, portion)):
-        yield portion_of_rows
+    while chunk := list(itertools.islice(rows, portion)):
+        yield chunk
 
 
 def write_text(path: Path, text: str | Iterable[str]) -> None:

@@ -54,13 +54,13 @@ class JsonFields:
             raise InputError(f"{self.path}: {key} is {show(value)}; expected {kind}")
         return array
 
-    def integer(self, key: str, default: int | None = None, least: int = 0) -> int:
-        """A whole number that is not less than `least`."""
+    def integer(self, key: str, default: int | None = None, minimum: int = 0) -> int:
+        """A whole number that is not less than `minimum`."""
         value = self.number(key, default)
         # Beyond 2⁵³ floats are all whole: a number there has lost digits.
-        if not (value.is_integer() and least <= value < 2**53):
+        if not (value.is_integer() and minimum <= value < 2**53):
             raise InputError(
-                f"{self.path}: {key} is {value:g}; expected a whole number from {least}"
+                f"{self.path}: {key} is {value:g}; expected a whole number from {minimum}"
             )
         return int(value)
 
@@ -68,16 +68,16 @@ class JsonFields:
         """A text; a number is converted to text."""
         value = self.get(key, default)
         if isinstance(value, bool) or not isinstance(value, str | int | float) or value == "":
-            fault = "missing" if value in (None, "") else f"{show(value)}; expected a text"
-            raise InputError(f"{self.path}: {key} is {fault}")
+            problem = "missing" if value in (None, "") else f"{show(value)}; expected a text"
+            raise InputError(f"{self.path}: {key} is {problem}")
         return str(value)
 
     def child(self, key: str) -> "JsonFields":
         """The object in a field."""
         value = self.get(key)
         if not isinstance(value, dict):
-            fault = "missing" if value is None else f"{show(value)}; expected an object"
-            raise InputError(f"{self.path}: {key} is {fault}")
+            problem = "missing" if value is None else f"{show(value)}; expected an object"
+            raise InputError(f"{self.path}: {key} is {problem}")
         return JsonFields(f"{self.path}, {key}", value)
 
     def objects(self, key: str) -> dict[str, "JsonFields"]:
@@ -109,10 +109,10 @@ def _object(where: str, value: Any) -> JsonFields:
 
 
 def stack_rows(
-    values: Sequence[Any], size: int, place: Callable[[int], tuple[str, str]]
+    values: Sequence[Any], size: int, location_of: Callable[[int], tuple[str, str]]
 ) -> Float[np.ndarray, "n size"]:
-    """Many lists of numbers as one array [len(values), size]; of the k-th, `place(k)` names file
-    and field.
+    """Many lists of numbers as one array [len(values), size]; of the k-th, `location_of(k)` names
+    file and field.
 
     **Raises:** `InputError` for the first invalid list.
     """
@@ -123,7 +123,7 @@ def stack_rows(
     if np.isfinite(array).all():
         return array
     # Only for a file with a fault: list by list, up to the faulty one.
-    rows = ((*place(k), value) for k, value in enumerate(values))
+    rows = ((*location_of(k), value) for k, value in enumerate(values))
     return np.array([JsonFields(path, {key: v}).array(key, (size,)) for path, key, v in rows])
 
 

@@ -42,42 +42,42 @@ def may_change_geometry(name: str) -> bool:
     name = HARMLESS.sub("grey", name)
     tokens = re.split(r"[\W_]+", name)
     words = {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
-    joined_tokens = "".join(tokens).lower()
+    joined_name = "".join(tokens).lower()
     return (
         re.search(r"(?:^|_)T_[A-Za-z]", name) is not None  # T_cam_imu, body_T_cam0: a pose
-        or any(stem in joined_tokens for stem in STEMS)
+        or any(stem in joined_name for stem in STEMS)
         or not WORDS.isdisjoint(words)
-        or joined_tokens.endswith(ENDINGS)
+        or joined_name.endswith(ENDINGS)
         or any(COEFFICIENT.fullmatch(word) for word in (*tokens, name))
     )
 
 
 class Keys:
-    """The keys of one kind of object: those a reader uses, and those it may leave.
+    """The keys of one kind of object: those a reader uses, and those it may ignore.
 
     **Arguments:**
 
-    - `left`: names, or patterns with *, that do not concern the result, and why.
+    - `ignored`: names, or patterns with *, that do not concern the result, and why.
     - `warned`: the same for what would concern it and is not read: each is a warning.
     """
 
     def __init__(
         self,
         used: Iterable[str],
-        left: Mapping[str, str] | None = None,
+        ignored: Mapping[str, str] | None = None,
         warned: Mapping[str, str] | None = None,
     ):
-        self.used, self.left, self.warned = tuple(used), dict(left or {}), dict(warned or {})
+        self.used, self.ignored, self.warned = tuple(used), dict(ignored or {}), dict(warned or {})
 
     @cached_property
-    def known(self) -> frozenset[str]:
+    def known_names(self) -> frozenset[str]:
         """All names and patterns."""
-        return frozenset((*self.used, *self.left, *self.warned))
+        return frozenset((*self.used, *self.ignored, *self.warned))
 
     @cached_property
     def patterns(self) -> tuple[str, ...]:
         """The names with a *."""
-        return tuple(name for name in self.known if "*" in name)
+        return tuple(name for name in self.known_names if "*" in name)
 
     def unknown(self, names: Iterable[str]) -> list[str]:
         """The names that are not known."""
@@ -88,10 +88,12 @@ class Keys:
         return name in self.used or any(fnmatchcase(name, part) for part in self.used)
 
     def _has(self, name: str) -> bool:
-        return name in self.known or any(fnmatchcase(name, part) for part in self.patterns)
+        return name in self.known_names or any(fnmatchcase(name, part) for part in self.patterns)
 
     def __or__(self, other: "Keys") -> "Keys":
-        return Keys((*self.used, *other.used), self.left | other.left, self.warned | other.warned)
+        return Keys(
+            (*self.used, *other.used), self.ignored | other.ignored, self.warned | other.warned
+        )
 
 
 LEAF = Keys((), {"version": "of the dictionary of the value"})
@@ -111,7 +113,7 @@ class UnknownKeys:
         **Raises:** `InputError` for a name that may change the geometry.
         """
         names = tuple(names)
-        if not keys.warned and keys.known.issuperset(names):
+        if not keys.warned and keys.known_names.issuperset(names):
             return  # millions of points have the same few keys
         for name in keys.warned.keys() & {*names}:
             self._places.setdefault((name, keys.warned[name]), []).append(str(where))
@@ -141,19 +143,21 @@ class UnknownKeys:
         entry has text alone. What may be left is left whole, with all that is in it.
         """
         patterns = [name for name in keys if "*" in name]
-        places = [(root, f"{where}: {root.tag[:60]}")]
-        while places:
-            element, place = places.pop()
+        pending = [(root, f"{where}: {root.tag[:60]}")]
+        while pending:
+            element, location = pending.pop()
             tag = element.tag
             if tag not in keys:
                 tag = next((name for name in patterns if fnmatchcase(tag, name)), tag)
-            keys_of_element = keys.get(tag, LEAF)
-            self.check_element(element, keys_of_element, place)
+            element_keys = keys.get(tag, LEAF)
+            self.check_element(element, element_keys, location)
             used_children = [
-                c for c in element if isinstance(c.tag, str) and keys_of_element.uses(c.tag)
+                c for c in element if isinstance(c.tag, str) and element_keys.uses(c.tag)
             ]
             # From the end of the list: the first of the document is the first to be refused.
-            places += [(child, f"{place}/{child.tag[:60]}") for child in reversed(used_children)]
+            pending += [
+                (child, f"{location}/{child.tag[:60]}") for child in reversed(used_children)
+            ]
 
     def check_objects(
         self, document: Mapping[str, Any], keys: Mapping[str, Keys], where: object
@@ -163,28 +167,32 @@ class UnknownKeys:
         `keys`: of the objects by their path, `""` for the document, `"items.resources"`; of a list,
         of all objects in it.
         """
-        places = [("", document, str(where))]
-        while places:
-            path, value, place = places.pop()
-            self.check(value, keys[path], place)
-            nested = []
+        pending = [("", document, str(where))]
+        while pending:
+            path, value, location = pending.pop()
+            self.check(value, keys[path], location)
+            inner_places = []
             for name, inner in value.items():
-                if (nested_path := f"{path}.{name}".lstrip(".")) not in keys:
+                if (inner_path := f"{path}.{name}".lstrip(".")) not in keys:
                     continue
                 rows = enumerate(inner) if isinstance(inner, list) else [(None, inner)]
                 for k, row in rows:
                     # What is no object is for its reader to refuse.
                     if isinstance(row, Mapping):
                         number = "" if k is None else f"[{k}]"
-                        nested.append((nested_path, row, f"{place}, {name}{number}"))
+                        inner_places.append((inner_path, row, f"{location}, {name}{number}"))
             # From the end of the list: the first of the document is the first to be refused.
-            places += reversed(nested)
+            pending += reversed(inner_places)
 
     def messages(self) -> tuple[str, ...]:
         """Warnings about the unknown keys."""
         return tuple(
             f"{places[0]}: "
-            + (f"{name} is not read: {why}" if why else f"unknown key {show(name)} is not read")
+            + (
+                f"{name} is not read: {reason}"
+                if reason
+                else f"unknown key {show(name)} is not read"
+            )
             + (f" (there, and in {len(places) - 1} more places)" if len(places) > 1 else "")
-            for (name, why), places in self._places.items()
+            for (name, reason), places in self._places.items()
         )

@@ -42,8 +42,8 @@ def parse_numbers(text: str) -> Float[np.ndarray, " n"]:
     """The numbers of a text that blanks and line feeds separate, without a text for each.
 
     **Raises:** `ValueError` for anything else."""
-    if len(text) > LONG_TEXT and (parsed := _parse_by_arrow(text)) is not None:
-        return parsed
+    if len(text) > LONG_TEXT and (numbers := _parse_by_arrow(text)) is not None:
+        return numbers
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # about text that is not a number
         try:
@@ -91,7 +91,7 @@ def parse_lines(lines: Iterable[str]) -> list[Float[np.ndarray, " n"]] | None:
 
 
 class TextRow:
-    """A line of a file: its place, text, and words."""
+    """A line of a file: its location, text, and words."""
 
     def __init__(self, path: Path, number: int, text: str, separator: str | None = None):
         self.path, self.number, self.text = path, number, text
@@ -108,29 +108,28 @@ class TextRow:
         return len(self.words)
 
     @property
-    def place(self) -> str:
+    def location(self) -> str:
         """File and line."""
         return f"{self.path}, line {self.number}"
 
     def error(self, message: str) -> InputError:
         """An error about this line, to be raised."""
-        return InputError(f"{self.place}: {message}")
+        return InputError(f"{self.location}: {message}")
 
     def numbers(
-        self, what: Sequence[str], first: int = 0, more: bool = False
+        self, names: Sequence[str], begin: int = 0, allow_more: bool = False
     ) -> Float[np.ndarray, " n"]:
-        """The numbers from the word `first` on, called `what`; no others unless `more`."""
-        words = self.words[first:]
-        if len(words) < len(what) or (len(words) > len(what) and not more):
-            blank_hint = BLANKS if len(words) > len(what) and self.separator is None else ""
+        """The numbers from the word `begin` on, called `names`; no others unless `allow_more`."""
+        words = self.words[begin:]
+        if len(words) < len(names) or (len(words) > len(names) and not allow_more):
+            hint = BLANKS if len(words) > len(names) and self.separator is None else ""
             raise self.error(
-                f"{len(words)} values where {len(what)} are expected "
-                f"({', '.join(what)}){blank_hint}"
+                f"{len(words)} values where {len(names)} are expected ({', '.join(names)}){hint}"
             )
-        return np.array([self._number(word, name) for word, name in zip(words, what)])
+        return np.array([self._number(word, word_name) for word, word_name in zip(words, names)])
 
-    def all_numbers(self, noun: str) -> Float[np.ndarray, " n"]:
-        """All words as numbers; `noun` names each in messages."""
+    def all_numbers(self, name: str) -> Float[np.ndarray, " n"]:
+        """All words as numbers, each called `name` in messages."""
         try:
             if self.separator is None and len(self.text) > LONG_ROW:
                 numbers = parse_numbers(self.text)
@@ -140,42 +139,42 @@ class TextRow:
             numbers = np.array([np.nan])
         # Python and NumPy read "1_0" as ten; in a file it is a name, or a mistake.
         if not np.isfinite(numbers).all() or "_" in self.text:
-            return np.array([self._number(word, noun) for word in self.words])
+            return np.array([self._number(word, name) for word in self.words])
         return numbers
 
-    def integer(self, k: int, noun: str, least: int = 0) -> int:
+    def integer(self, k: int, name: str, minimum: int = 0) -> int:
         """The k-th word as a whole number."""
         word = self.words[k] if k < len(self.words) else ""
         digits = word.removeprefix("-")
         # 18 digits fit in 64 bits; isascii, because digits of other scripts count as digits
-        if not (digits.isascii() and digits.isdigit() and len(digits) < 19) or int(word) < least:
-            raise self.error(f"{noun} is {show(word)}; expected a whole number from {least}")
+        if not (digits.isascii() and digits.isdigit() and len(digits) < 19) or int(word) < minimum:
+            raise self.error(f"{name} is {show(word)}; expected a whole number from {minimum}")
         return int(word)
 
-    def rays(self, k: int, noun: str, images: int, image: str) -> Float[np.ndarray, "n 4"]:
+    def rays(self, k: int, row_name: str, images: int, image_name: str) -> Float[np.ndarray, "n 4"]:
         """The rays that end a row, of which number `k` is the count: image, key, x, y each; images
         are numbered from 0 to `images` − 1."""
-        numbers, claimed = self.all_numbers(noun), self.integer(k, "the number of rays")
-        if len(numbers) != k + 1 + 4 * claimed:
+        numbers, announced = self.all_numbers(row_name), self.integer(k, "the number of rays")
+        if len(numbers) != k + 1 + 4 * announced:
             raise self.error(
-                f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
+                f"{announced} rays are announced; {4 * announced} numbers should follow, not "
                 f"{len(numbers) - k - 1}"
             )
         rays = numbers[k + 1 :].reshape(-1, 4)
-        for image_number in rays[:, 0]:
-            if not (0 <= image_number < images and image_number % 1 == 0):
+        for number in rays[:, 0]:
+            if not (0 <= number < images and number % 1 == 0):
                 raise self.error(
-                    f"{image} {image_number:g} does not exist; there are {images}, from 0"
+                    f"{image_name} {number:g} does not exist; there are {images}, from 0"
                 )
         return rays
 
-    def _number(self, word: str, noun: str) -> float:
+    def _number(self, word: str, name: str) -> float:
         try:
             number = float(word)
         except ValueError:
             number = math.nan
         if not math.isfinite(number) or "_" in word:
-            raise self.error(f"{noun} is {show(word)}; expected a number")
+            raise self.error(f"{name} is {show(word)}; expected a number")
         return number
 
 
@@ -206,25 +205,27 @@ class TextRows:
         self.position = 0
 
     def __iter__(self) -> Iterator[TextRow]:
-        while self.more():
+        while self.has_more():
             yield self.take("a line")
 
-    def more(self) -> bool:
+    def has_more(self) -> bool:
         """Whether there is another line."""
         return self.position < len(self.lines)
 
-    def take(self, noun: str) -> TextRow:
-        """The next line; `noun` names the expected content in messages.
+    def take(self, expected: str) -> TextRow:
+        """The next line; `expected`: its content in words, for messages.
 
         **Raises:** `InputError` if the file has ended.
         """
-        if not self.more():
+        if not self.has_more():
             last_line = self.lines[-1][0] if self.lines else 0
-            raise InputError(f"{self.path}: the file ends after line {last_line}; expected {noun}")
+            raise InputError(
+                f"{self.path}: the file ends after line {last_line}; expected {expected}"
+            )
         number, text = self.lines[self.position]
         self.position += 1
         return TextRow(self.path, number, text, self.separator)
 
     def next_words(self) -> list[str]:
         """The words of the next line without taking it; none at the end of the file."""
-        return self.lines[self.position][1].split(self.separator) if self.more() else []
+        return self.lines[self.position][1].split(self.separator) if self.has_more() else []

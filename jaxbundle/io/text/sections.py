@@ -44,7 +44,7 @@ class TomlFile:
 
 
 def read_sections(
-    path: Path, sections: Mapping[str, Sequence[str]], needed: Sequence[str]
+    path: Path, sections: Mapping[str, Sequence[str]], required: Sequence[str]
 ) -> TomlFile:
     """A TOML file with known sections and keys (an empty list: any key).
 
@@ -58,7 +58,7 @@ def read_sections(
         if sections[key]:
             TomlSection(None, f"{path}, [{key}]: ", value).check_keys(sections[key])
     file = TomlFile(path, document)
-    file.require(needed)
+    file.require(required)
     return file
 
 
@@ -82,10 +82,10 @@ class TomlSection:
             raise InputError(f"{self.where}{key} is {show(value)}; expected {expected}")
         return value
 
-    def check_keys(self, known_keys: Sequence[str]) -> None:
+    def check_keys(self, allowed_keys: Sequence[str]) -> None:
         """Refuse other keys."""
         for key in self.values:
-            refuse_unknown(key, known_keys, self.where)
+            refuse_unknown(key, allowed_keys, self.where)
 
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""
@@ -113,8 +113,8 @@ class TomlSection:
         """A list of finite numbers, of a given length."""
         expected = f"a list of {count or 'some'} numbers"
         values = self._get(key, None, expected, (list,))
-        good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-        if not good or not values or count not in (None, len(values)):
+        are_numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+        if not are_numbers or not values or count not in (None, len(values)):
             raise InputError(f"{self.where}{key} is {show(values)}; expected {expected}")
         array = np.array(values, float)
         if not np.isfinite(array).all():
@@ -127,22 +127,22 @@ class TomlSection:
         name = self.text(key)
         path = self.beside(name)
         if not name or not os.path.exists(path):
-            got = f"no such file {path}" if name else "the name of a file is missing"
+            problem = f"no such file {path}" if name else "the name of a file is missing"
         elif not folder and os.path.isdir(path):
-            got = f"{path} is a folder"
+            problem = f"{path} is a folder"
         else:
             return path
-        raise InputError(f"{self.where}{key} = {show(name)}: {got}; expected {expected}")
+        raise InputError(f"{self.where}{key} = {show(name)}: {problem}; expected {expected}")
 
     def paths(self, key: str, expected: str) -> list[Path]:
         """The files that a key names, one or a list of them."""
-        names_given = self.values.get(key)
-        if not isinstance(names_given, list):
+        names = self.values.get(key)
+        if not isinstance(names, list):
             return [self.path(key, expected)]
-        if not names_given:
+        if not names:
             raise InputError(f"{self.where}{key} is an empty list; expected {expected}")
         section_of = lambda name: TomlSection(self.file, self.where, {key: name})
-        return [section_of(name).path(key, expected) for name in names_given]
+        return [section_of(name).path(key, expected) for name in names]
 
     def beside(self, name: str) -> Path:
         """The path of a name beside the file of the section."""

@@ -47,21 +47,21 @@ class StoredRows:
 
     def __getitem__(self, rows: int | Sequence[int] | Int[np.ndarray, "..."]) -> np.ndarray:
         """A row, or the rows of a list of numbers."""
-        wanted_rows = np.atleast_1d(np.asarray(rows, int))
+        row_numbers = np.atleast_1d(np.asarray(rows, int))
         # One array: a list of rows would be copied once more.
-        rows_found = np.empty((len(wanted_rows), *self.shape[1:]), self.dtype)
+        values = np.empty((len(row_numbers), *self.shape[1:]), self.dtype)
         size = int(np.prod(self.shape[1:]))
         # Consecutive rows are read together.
-        ends = [0, *(np.flatnonzero(np.diff(wanted_rows) != 1) + 1), len(wanted_rows)]
+        ends = [0, *(np.flatnonzero(np.diff(row_numbers) != 1) + 1), len(row_numbers)]
         opened = self.path.open("rb") if self.unpacked is None else nullcontext(self.unpacked)
         with opened as stream:
             for begin, end in zip(ends, ends[1:]):
-                stream.seek(self.offset + int(wanted_rows[begin]) * size * self.dtype.itemsize)
-                numbers_read = np.fromfile(stream, self.dtype, (end - begin) * size)
-                if numbers_read.size < (end - begin) * size:
+                stream.seek(self.offset + int(row_numbers[begin]) * size * self.dtype.itemsize)
+                run_values = np.fromfile(stream, self.dtype, (end - begin) * size)
+                if run_values.size < (end - begin) * size:
                     raise InputError(f"{self.path}: became shorter while it was read")
-                rows_found[begin:end] = numbers_read.reshape(-1, *self.shape[1:])
-        return rows_found[0] if np.ndim(rows) == 0 else rows_found
+                values[begin:end] = run_values.reshape(-1, *self.shape[1:])
+        return values[0] if np.ndim(rows) == 0 else values
 
 
 def find_stored_rows(

@@ -10,9 +10,9 @@ import numpy as np
 
 def assignments(table: Mapping) -> Iterable[str]:
     """The lines `key = value` of a table."""
-    bare = lambda key: re.fullmatch(r"[A-Za-z0-9_-]+", key)  # other keys need quotes
+    is_bare_key = lambda key: re.fullmatch(r"[A-Za-z0-9_-]+", key)  # other keys need quotes
     return (
-        f"{key if bare(key) else toml_value(str(key))} = {toml_value(value)}"
+        f"{key if is_bare_key(key) else toml_value(str(key))} = {toml_value(value)}"
         for key, value in table.items()
     )
 

@@ -26,12 +26,12 @@ def read_vertices(where: str, content: bytes, names: tuple[str, ...]) -> np.ndar
 
     **Raises:** `InputError` for another file, lists before the end, a wrong length, and
     missing properties."""
-    match = re.match(rb"ply\r?\nformat (\S+) 1\.0\r?\n(.*?)end_header\r?\n", content, re.DOTALL)
-    if match is None or match[1] not in ORDER:
+    header = re.match(rb"ply\r?\nformat (\S+) 1\.0\r?\n(.*?)end_header\r?\n", content, re.DOTALL)
+    if header is None or header[1] not in ORDER:
         raise InputError(f"{where}: expected a binary PLY")
     # Properties belong to the element above them.
     fields, number, current = [], 0, ""
-    for line in match[2].decode("ascii", errors="replace").splitlines():
+    for line in header[2].decode("ascii", errors="replace").splitlines():
         match line.split():
             case ["element", current, many] if many.isdigit():
                 if current == "vertex":
@@ -40,19 +40,19 @@ def read_vertices(where: str, content: bytes, names: tuple[str, ...]) -> np.ndar
                 elif not fields:
                     raise InputError(f"{where}: expected its vertices first")
             case ["property", kind, name] if current == "vertex" and kind in TYPES:
-                fields.append((name, ORDER[match[1]] + TYPES[kind]))
+                fields.append((name, ORDER[header[1]] + TYPES[kind]))
             case ["property", *_] if current == "vertex":
                 raise InputError(f"{where}: a property of another type is not read: {line}")
     try:
         dtype = np.dtype(fields)
     except ValueError:
         raise InputError(f"{where}: two properties have one name") from None
-    missing_properties = [name for name in names if name not in (dtype.names or ())]
-    if missing_properties:
-        raise InputError(f"{where}: the property {missing_properties[0]} is missing")
-    if number * dtype.itemsize > len(content) - match.end():
+    missing_names = [name for name in names if name not in (dtype.names or ())]
+    if missing_names:
+        raise InputError(f"{where}: the property {missing_names[0]} is missing")
+    if number * dtype.itemsize > len(content) - header.end():
         raise InputError(f"{where}: is damaged: it is shorter than its header states")
-    table = np.frombuffer(content, dtype, number, match.end())
+    table = np.frombuffer(content, dtype, number, header.end())
     for name in names:
         if not np.isfinite(table[name]).all():
             raise InputError(f"{where}: expected a finite {name} of every vertex")

@@ -37,7 +37,7 @@ class XmlFields:
         element = self.find(key)
         text = default if element is None else (element.text or "")
         if text is None:
-            raise self.missing(key)
+            raise self.missing_error(key)
         return text.strip()
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -58,20 +58,20 @@ class XmlFields:
 
     def elements(self, key: str) -> list[ET.Element]:
         """Repeated elements, from the first list of them."""
-        parent, _, last_name = key.rpartition("/")
-        parent_element = self.find(parent)
-        elements = [] if parent_element is None else parent_element.findall(last_name)
+        parent, _, tag = key.rpartition("/")
+        list_element = self.find(parent)
+        elements = [] if list_element is None else list_element.findall(tag)
         if not elements:
-            raise self.missing(key)
+            raise self.missing_error(key)
         return elements
 
     def columns(self, key: str, names: Sequence[str]) -> Float[np.ndarray, "elements names"]:
         """Numbers [elements, names] of repeated elements."""
-        last_name = key.rpartition("/")[2]
+        tag = key.rpartition("/")[2]
         return np.array(
             [
                 [
-                    number_in(e.findtext(name, ""), f"{self.path}: {last_name} {k}, {name}")
+                    number_in(e.findtext(name, ""), f"{self.path}: {tag} {k}, {name}")
                     for name in names
                 ]
                 for k, e in enumerate(self.elements(key), 1)
@@ -82,14 +82,14 @@ class XmlFields:
         self, key: str, epoch: np.datetime64, name: str = "TIME"
     ) -> Float[np.ndarray, " elements"]:
         """Seconds since the epoch of repeated elements."""
-        last_name = key.rpartition("/")[2]
+        tag = key.rpartition("/")[2]
         times = [
-            time_in(e.findtext(name, ""), f"{self.path}: {last_name} {k}, {name}")
+            time_in(e.findtext(name, ""), f"{self.path}: {tag} {k}, {name}")
             for k, e in enumerate(self.elements(key), 1)
         ]
         return np.array([seconds(t, epoch) for t in times])
 
-    def missing(self, key: str) -> InputError:
+    def missing_error(self, key: str) -> InputError:
         """The error for a missing element."""
         return InputError(f"{self.path}: {key} is missing; expected {self.kind}")
 
@@ -128,10 +128,10 @@ def number_in(text: str, where: str) -> float:
     """The finite number in a text."""
     try:
         value = float(text)
-        good = np.isfinite(value) and "_" not in text
+        is_valid = np.isfinite(value) and "_" not in text
     except ValueError:
-        good = False
-    if not good:
+        is_valid = False
+    if not is_valid:
         raise InputError(f"{where} is {show(text)}; expected a finite number")
     return value
 

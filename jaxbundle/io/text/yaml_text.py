@@ -70,10 +70,10 @@ def parse_document(path: str | Path, text: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""
-        fault = error.problem or error.context or "damaged"
+        message = error.problem or error.context or "damaged"
         if mark and any("\t" in line for line in text.split("\n")[mark.line : mark.line + 1]):
-            fault += "; blanks indent, not tabs"
-        raise InputError(f"{path}{line}: not valid YAML: {fault}") from None
+            message += "; blanks indent, not tabs"
+        raise InputError(f"{path}{line}: not valid YAML: {message}") from None
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
@@ -163,13 +163,13 @@ def _loader() -> Any:
             node = self.get_node() if self.check_node() else None
             return None if node is None else self.construct_document(node)
 
-    def whole_number(_loader: Any, node: Any) -> int:
+    def parse_integer(_loader: Any, node: Any) -> int:
         digits = node.value.lstrip("+-0")
         if len(digits) > len(str(LARGEST_INTEGER)):
             raise yaml.MarkedYAMLError(problem=TOO_LARGE, problem_mark=node.start_mark)
         return int(node.value)
 
-    def real(_loader: Any, node: Any) -> float:
+    def parse_real(_loader: Any, node: Any) -> float:
         text = node.value.lower()
         return float(text.replace(".", "") if text.endswith(("inf", "nan")) else text)
 
@@ -184,8 +184,8 @@ def _loader() -> Any:
     for tag, form, first_characters in CORE_SCHEMA:
         tag = f"tag:yaml.org,2002:{tag}"
         Loader.add_implicit_resolver(tag, re.compile(f"(?:{form})$"), list(first_characters))
-    Loader.add_constructor("tag:yaml.org,2002:int", whole_number)
-    Loader.add_constructor("tag:yaml.org,2002:float", real)
+    Loader.add_constructor("tag:yaml.org,2002:int", parse_integer)
+    Loader.add_constructor("tag:yaml.org,2002:float", parse_real)
     for prefix in ("tag:yaml.org,2002:", "!", ""):
         Loader.add_multi_constructor(prefix, content)
     return Loader

@@ -58,21 +58,21 @@ def of_input(path: str | Path) -> str:
 def input_files(path: str | Path) -> Iterator[Path]:
     """The files of an input of `read_network`: itself and named files, or those of its folder."""
     project = project_file(Path(path))
-    return _files(project if project.is_file() else Path(path))
+    return _named_files(project if project.is_file() else Path(path))
 
 
 def files_read(path: str | Path) -> list[Path]:
     """An input in TOML, the files it names, and those named by these."""
-    file_of_path, files_left = {}, [Path(path)]
-    while files_left:
-        file = files_left.pop()
-        if (real := os.path.realpath(file)) not in file_of_path:
-            file_of_path[real] = file
-            files_left += _files(file)
-    return [*file_of_path.values()]
+    file_by_path, pending = {}, [Path(path)]
+    while pending:
+        file = pending.pop()
+        if (real := os.path.realpath(file)) not in file_by_path:
+            file_by_path[real] = file
+            pending += _named_files(file)
+    return [*file_by_path.values()]
 
 
-def _files(path: Path) -> Iterator[Path]:
+def _named_files(path: Path) -> Iterator[Path]:
     """A file and those it names, or the files of a folder."""
     if path.is_dir():
         yield from sorted(

@@ -24,11 +24,11 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 @contextmanager
 def hold_lock(
-    path: str | Path, name: str | Path | None = None, needed: bool = True
+    path: str | Path, display_name: str | Path | None = None, needed: bool = True
 ) -> Iterator[None]:
     """Hold the lock of a file, which need not exist; devices and pipes have none.
 
-    **Arguments:** `name`: the name in messages, by default the file; `needed`:
+    **Arguments:** `display_name`: the name in messages, by default the file; `needed`:
     whether a file system without locks is an error.
 
     **Raises:** `InputError` if another process holds it, or it cannot be locked.
@@ -36,15 +36,15 @@ def hold_lock(
     if os.path.exists(path) and not os.path.isfile(path):
         yield
         return
-    real, shown_name = Path(os.path.realpath(path)), path if name is None else name
-    if not real.parent.is_dir():
-        raise InputError(f"{shown_name}: there is no folder {real.parent}")
-    lock = real.with_name(f".{real.name}.lock")
-    with ExitStack() as resources:
+    real_path, name = Path(os.path.realpath(path)), path if display_name is None else display_name
+    if not real_path.parent.is_dir():
+        raise InputError(f"{name}: there is no folder {real_path.parent}")
+    lock = real_path.with_name(f".{real_path.name}.lock")
+    with ExitStack() as cleanup:
         with defer_interrupts():  # A lock is removed only by the process that holds it.
-            resources.enter_context(_acquire(lock, shown_name, needed))
+            cleanup.enter_context(_acquire(lock, name, needed))
             # Removed before release: no other process locks a file about to vanish.
-            resources.enter_context(temporary(lock))
+            cleanup.enter_context(temporary(lock))
         yield
     # Windows cannot remove open files: there it is removed now, unless another process has opened
     # it meanwhile.
@@ -53,7 +53,7 @@ def hold_lock(
             lock.unlink()
 
 
-def _acquire(lock: Path, shown_name: str | Path, needed: bool) -> BinaryIO:
+def _acquire(lock: Path, name: str | Path, needed: bool) -> BinaryIO:
     """The locked file.
 
     **Raises:** `InputError` as `hold_lock`."""
@@ -62,12 +62,11 @@ def _acquire(lock: Path, shown_name: str | Path, needed: bool) -> BinaryIO:
             pass
     except BlockingIOError:
         raise InputError(
-            f"{shown_name}: another run is writing it; wait for its end, or give another name"
+            f"{name}: another run is writing it; wait for its end, or give another name"
         ) from None
     except OSError as error:
         raise InputError(
-            f"{shown_name}: its lock {lock} cannot be made: {error.strerror}; the folder must be "
-            "writable"
+            f"{name}: its lock {lock} cannot be made: {error.strerror}; the folder must be writable"
         ) from None
     return stream
 

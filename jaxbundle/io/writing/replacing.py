@@ -32,25 +32,26 @@ def replace_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
 
     **Raises:** `InputError` for disk errors, and if the path exists but is not a file.
     """
-    real = [Path(os.path.realpath(path)) for path in paths]
-    for path, target in zip(paths, real):
+    real_paths = [Path(os.path.realpath(path)) for path in paths]
+    for path, target in zip(paths, real_paths):
         if target.exists() and not target.is_file():
             raise InputError(f"{path}: cannot be written: it is not a file; give another name")
     # Names have 255 bytes at most: 60 characters of up to 4 leave room for the rest.
     names = tuple(
-        target.with_name(f".{target.stem[:60]}.{os.getpid()}{target.suffix}") for target in real
+        target.with_name(f".{target.stem[:60]}.{os.getpid()}{target.suffix}")
+        for target in real_paths
     )
-    with ExitStack() as until:
+    with ExitStack() as cleanup:
         for name in names:
-            until.enter_context(temporary(name))
+            cleanup.enter_context(temporary(name))
         try:
             yield names
             with defer_interrupts():
-                for name, target in zip(names, real):
+                for name, target in zip(names, real_paths):
                     os.replace(name, target)
         except OSError as error:
-            path_of = dict(zip(map(str, names), paths))
-            raise unwritable(path_of.get(str(error.filename), paths[0]), error) from None
+            path_of_name = dict(zip(map(str, names), paths))
+            raise unwritable(path_of_name.get(str(error.filename), paths[0]), error) from None
         except InputError as error:
             message = str(error)
             for name, path in zip(names, paths):
@@ -85,19 +86,19 @@ def _is_running(process: int) -> bool:
 
 def unwritable(path: str | Path, error: OSError) -> InputError:
     """Why a file or folder cannot be written, in one line; a full disk is named."""
-    why = error.strerror or " ".join(str(error).split())
+    reason = error.strerror or " ".join(str(error).split())
     if isinstance(error, FileNotFoundError) and not Path(path).absolute().parent.is_dir():
-        why = f"there is no folder {Path(path).parent}"
-    full = error.errno in DISK_FULL and (os.path.isfile(path) or not os.path.exists(path))
-    return InputError(f"{path}: cannot be written: {why}{disk_of(path) if full else ''}")
+        reason = f"there is no folder {Path(path).parent}"
+    is_full = error.errno in DISK_FULL and (os.path.isfile(path) or not os.path.exists(path))
+    return InputError(f"{path}: cannot be written: {reason}{disk_of(path) if is_full else ''}")
 
 
 def disk_of(path: str | Path) -> str:
     """The disk of a file and its free space, as the end of a message."""
-    place = Path(os.path.realpath(path))
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
-    while not os.path.ismount(place):
-        place = place.parent
-    return f"; {free / 1e6:.6g} MB are free on the disk at {place}"
+    folder = Path(os.path.realpath(path))
+    while not folder.exists():
+        folder = folder.parent
+    free_bytes = shutil.disk_usage(folder).free
+    while not os.path.ismount(folder):
+        folder = folder.parent
+    return f"; {free_bytes / 1e6:.6g} MB are free on the disk at {folder}"

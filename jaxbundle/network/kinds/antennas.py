@@ -52,21 +52,25 @@ AXES = ("X", "Y", "Z")
 SECTION = "antenna"
 
 
-def antenna(
-    pose: Posed, arm: Triple, strip: Change, clock: Change, observed: tuple[Triple, Scalar, Triple]
+def antenna_misclosure(
+    pose: Posed,
+    arm: Triple,
+    strip: Change,
+    clock: Change,
+    measurement: tuple[Triple, Scalar, Triple],
 ) -> Triple:
-    """The position of an antenna minus the measured one; `observed`: the measured one, the time
-    since the mean of the strip, the velocity."""
-    measured, time_in_strip, velocity = observed
+    """The position of an antenna minus the measured one; `measurement`: the measured one, the
+    time since the mean of the strip, the velocity."""
+    measured, time, velocity = measurement
     return tuple(
-        x + strip[k] + strip[3 + k] * time_in_strip + velocity[k] * clock[0] - measured[k]
+        x + strip[k] + strip[3 + k] * time + velocity[k] * clock[0] - measured[k]
         for k, x in enumerate(pose.place(arm))
     )
 
 
 POSITION = Kind(
     "antenna positions",
-    antenna,
+    antenna_misclosure,
     ("image", "lever arm", "GNSS strip", "GNSS clock"),
     AXES,
     "length",
@@ -155,10 +159,10 @@ class Antennas(ObservationTable):
         strips, strip = np.unique(np.array(self.strip, dtype=object), return_inverse=True)
         parameters = _by_axis(Parameters.from_settings(SECTION, self.settings, FREE))
         cameras = [network.cameras[c].id for c in camera]
-        start = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
+        lever_arm = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
         arm = Table(
             "lever arm",
-            three_by_camera(SECTION, "lever_arm", start, cameras),
+            three_by_camera(SECTION, "lever_arm", lever_arm, cameras),
             Vector(3),
             parameters.mask(ARM),
             cameras,
@@ -167,7 +171,7 @@ class Antennas(ObservationTable):
         )
         # Velocities are numbers, not unknowns: their errors times the offset of a clock
         # (milliseconds) are far below the σ of a position.
-        since, velocity = _track(self.position, strip, self.time)
+        time_in_strip, velocity = _times_and_velocities(self.position, strip, self.time)
         if "time_offset" in parameters.free and not velocity.any():
             raise InputError(f"{self.source.name}: time_offset needs three positions in a strip")
         # One row a strip of shift and drift: a drift is that about the mean time, or it would be
@@ -192,7 +196,7 @@ class Antennas(ObservationTable):
         )
         observations = POSITION(
             (image, of_camera, strip, np.zeros(len(self), int)),
-            (self.position - origin, since, velocity),
+            (self.position - origin, time_in_strip, velocity),
             covariance=self.covariance,
         )
         priors = (
@@ -218,21 +222,21 @@ def _shift_back(motion: Float[Array, "7"], strip: Float[Array, "6"]) -> Float[Ar
     return strip.at[:3].add(-motion[:3])
 
 
-def _track(
+def _times_and_velocities(
     position: Float[np.ndarray, "rows 3"],
     strip: Int[np.ndarray, " rows"],
     time: Float[np.ndarray, " rows"],
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows 3"]]:
     """The time of every position since the mean of its strip, and the velocity there (0 if a strip
     has fewer than three)."""
-    since, velocity = np.zeros(len(time)), np.zeros_like(position)
+    time_in_strip, velocity = np.zeros(len(time)), np.zeros_like(position)
     if np.isnan(time).any():
-        return since, velocity
+        return time_in_strip, velocity
     for s in range(strip.max() + 1 if len(strip) else 0):
         rows = np.flatnonzero(strip == s)
-        since[rows] = time[rows] - time[rows].mean()
+        time_in_strip[rows] = time[rows] - time[rows].mean()
         # Central differences need two neighbours; equal times have none.
         if len(np.unique(time[rows])) == len(rows) >= 3:
             order = rows[np.argsort(time[rows])]
             velocity[order] = np.gradient(position[order], time[order], axis=0)
-    return since, velocity
+    return time_in_strip, velocity

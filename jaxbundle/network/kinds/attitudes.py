@@ -48,10 +48,10 @@ def attitude(pose: Posed, boresight: Turned, measured: Float[Array, "3"]) -> Flo
     return omega_phi_kappa_near(M, measured) - measured
 
 
-def boresight_misclosure(boresight: Turned, observed: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def boresight_misclosure(boresight: Turned, prior: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """The rotation vector of a boresight relative to the given one [3, 3], for small
     differences."""
-    R = boresight.matrix() @ observed.T
+    R = boresight.matrix() @ prior.T
     return 0.5 * jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
@@ -106,11 +106,11 @@ class Attitudes(ObservationTable):
         cameras = [network.cameras[c].id for c in camera]
         radians = ANGLE_UNITS[network.angle_unit]
         parameters = Parameters.from_settings(SECTION, self.settings, ("boresight",))
-        start = self.settings.get("boresight", [0.0, 0.0, 0.0])
+        start_angles = self.settings.get("boresight", [0.0, 0.0, 0.0])
         M = np.stack(
             [
                 np.asarray(matrix_from_omega_phi_kappa(radians * angles))
-                for angles in three_by_camera(SECTION, "boresight", start, cameras)
+                for angles in three_by_camera(SECTION, "boresight", start_angles, cameras)
             ]
         )
         boresight = Table(

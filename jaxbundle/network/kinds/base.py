@@ -93,7 +93,7 @@ class ObservationTable(abc.ABC):
 
     @abc.abstractmethod
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
-        """The tables and observations for a network that contains all rows (`present_kinds`)."""
+        """The tables and observations for a network that contains all rows (`restrict_to`)."""
 
     def __len__(self) -> int:
         return len(getattr(self, (*self.IMAGES, *self.POINTS)[0]))
@@ -105,14 +105,14 @@ class ObservationTable(abc.ABC):
         take_rows = lambda x: (
             x[rows] if isinstance(x, np.ndarray) else tuple(x[row] for row in rows)
         )
-        taken = {name: take_rows(getattr(self, name)) for name in names}
-        return dataclasses.replace(self, source=self.source.take(rows), **taken)
+        fields = {name: take_rows(getattr(self, name)) for name in names}
+        return dataclasses.replace(self, source=self.source.take(rows), **fields)
 
-    def present_kinds(self, network: Network) -> Self:
+    def restrict_to(self, network: Network) -> Self:
         """The rows whose images and points are all in the network."""
-        return self.take(self._present(network))
+        return self.take(self._included_rows(network))
 
-    def _present(self, network: Network) -> np.ndarray:
+    def _included_rows(self, network: Network) -> np.ndarray:
         # Rows about objects that were left out go with them, without an error.
         keep = np.ones(len(self), bool)
         for fields, known_ids in (
@@ -222,10 +222,10 @@ def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]
     return np.array([row[id] for id in ids], int)
 
 
-def present_kinds(network: Network) -> list[ObservationTable]:
+def included_tables(network: Network) -> list[ObservationTable]:
     """The observations of further kinds of a network whose images and points are all included."""
-    with_present_rows = (kind.among(network) for kind in network.further)
-    return [kind for kind in with_present_rows if len(kind)]
+    restricted = (table.restrict_to(network) for table in network.further)
+    return [table for table in restricted if len(table)]
 
 
 def positive_sigma(
@@ -240,12 +240,12 @@ def positive_sigma(
     return sigma
 
 
-def check_settings(section: str, settings: Mapping[str, Any], known_keys: Sequence[str]) -> None:
+def check_settings(section: str, settings: Mapping[str, Any], known_names: Sequence[str]) -> None:
     """Refuse settings of a section that are not known."""
     if not isinstance(settings, Mapping):
         raise InputError(f"[{section}]: expected a section of settings, got {show(settings)}")
     for key in settings:
-        refuse_unknown(key, known_keys, f"[{section}]: ")
+        refuse_unknown(key, known_names, f"[{section}]: ")
 
 
 def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray, " length"]:
@@ -253,12 +253,12 @@ def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray
 
     **Raises:** `InputError`."""
     try:
-        array = np.array(value, float)
+        vector = np.array(value, float)
     except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != (length,) or not np.isfinite(array).all():
+        vector = np.zeros(0)
+    if vector.shape != (length,) or not np.isfinite(vector).all():
         raise InputError(f"[{section}]: {key} is {show(value)}; expected {length} numbers")
-    return array
+    return vector
 
 
 def three_by_camera(
@@ -329,6 +329,6 @@ class Parameters:
         return [kind((np.arange(table.rows),), table.value, sigma=sigma)]
 
 
-def computed_minus_given(value: Any, observed: Any) -> Any:
+def computed_minus_given(value: Any, prior: Any) -> Any:
     """Computed minus given."""
-    return value - observed
+    return value - prior

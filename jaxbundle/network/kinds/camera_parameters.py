@@ -74,7 +74,7 @@ class CameraParameters(ObservationTable):
     def __len__(self) -> int:
         return len(self.camera)
 
-    def _present(self, network: Network) -> Bool[np.ndarray, " n"]:
+    def _included_rows(self, network: Network) -> Bool[np.ndarray, " n"]:
         known_ids = {camera.id for camera in network.cameras}
         return np.array([id in known_ids for id in self.camera], bool)
 
@@ -100,16 +100,11 @@ class CameraParameters(ObservationTable):
                     )
             groups = {name: group for group in camera.tie for name in group}
             # A ratio of two tied parameters is a constant, and a held parameter no unknown.
-            is_ratio_of_equal = len(names) == 2 and groups.get(names[0], {*names}) == groups.get(
-                names[1]
-            )
-            if is_ratio_of_equal or not {*camera.free} & {
-                m for n in names for m in groups.get(n, (n,))
-            }:
+            is_constant = len(names) == 2 and groups.get(names[0], {*names}) == groups.get(names[1])
+            if is_constant or not {*camera.free} & {m for n in names for m in groups.get(n, (n,))}:
                 raise InputError(
                     f"{self.source(row)}: {parameter} of camera {id!r} cannot change: expected "
-                    f"{' or '.join(names)} to be free"
-                    + (" and not tied" if is_ratio_of_equal else "")
+                    f"{' or '.join(names)} to be free" + (" and not tied" if is_constant else "")
                 )
 
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
@@ -131,11 +126,11 @@ class CameraParameters(ObservationTable):
         return Contribution(
             (),
             tuple(
-                kind(*tables)(
+                kind(*key)(
                     (np.array([place[index[self.camera[row]]][1] for row in rows]),),
                     self.value[rows],
                     sigma=self.sigma[rows],
                 )
-                for tables, rows in sets.items()
+                for key, rows in sets.items()
             ),
         )

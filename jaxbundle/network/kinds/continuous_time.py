@@ -56,19 +56,19 @@ def place_on_spline(controls: Sequence[Posed], u: Scalar, X: Triple) -> Triple:
     """p + Mᵀ·X at a place u between the knots."""
     position = spline_position([control.centre for control in controls], u)
     # M(t)ᵀ·X = M_iᵀ·(M_i·M(t)ᵀ·X): only steps between controls have parts of the basis
-    turns = [control.rotation for control in controls]
-    turned_ray = turn_back_by_steps([_step(*pair) for pair in zip(turns, turns[1:])], u, X)
-    return tuple(a + b for a, b in zip(position, turns[0].apply_inverse(turned_ray)))
+    rotations = [control.rotation for control in controls]
+    turned = turn_back_by_steps([_step(*pair) for pair in zip(rotations, rotations[1:])], u, X)
+    return tuple(a + b for a, b in zip(position, rotations[0].apply_inverse(turned)))
 
 
-def _step(rotation_a: Turned, rotation_b: Turned) -> Triple:
+def _step(start: Turned, end: Turned) -> Triple:
     """The Gibbs vector of the rotation from one to the other; of the small rotations that both
     have besides, θ/2 to second order."""
-    h = gibbs_vector(rotation_b.rows, rotation_a.rows)
-    if rotation_b.turn is not None:
-        h = compose_gibbs(tuple(t / 2 for t in rotation_b.turn), h)
-    if rotation_a.turn is not None:
-        h = compose_gibbs(h, tuple(-t / 2 for t in rotation_a.turn))
+    h = gibbs_vector(end.rows, start.rows)
+    if end.turn is not None:
+        h = compose_gibbs(tuple(t / 2 for t in end.turn), h)
+    if start.turn is not None:
+        h = compose_gibbs(h, tuple(-t / 2 for t in start.turn))
     return h
 
 
@@ -80,8 +80,8 @@ class TimedImagePoint:
     model: str | cameras.CameraModel
     domain: str
 
-    def __call__(self, *blocks: Any) -> Change:
-        *poses, clock, mounting, interior, ray, (xy, instant) = blocks
+    def __call__(self, *blocks_and_measured: Any) -> Change:
+        *poses, clock, mounting, interior, ray, (xy, instant) = blocks_and_measured
         board, controls = poses[:-4], poses[-4:]
         for pose in board:
             ray = pose.ray(ray)
@@ -99,8 +99,8 @@ def timed_image_points(
     """Image points of the cameras of one model, whose table is `camera`, on a `mounting`, of a
     target that moves along a spline; `board`: the table of boards on bodies. Measured are x, y and
     the `Instant`."""
-    tables_of_board = () if board is None else (board,)
-    tables = (*tables_of_board, *[TRAJECTORY] * 4, CLOCK, mounting, camera, "point")
+    boards = () if board is None else (board,)
+    tables = (*boards, *[TRAJECTORY] * 4, CLOCK, mounting, camera, "point")
     name = "image coordinates"
     if camera != "camera":
         name += f" of {cameras.get_model(model).name}"

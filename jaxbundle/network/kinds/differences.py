@@ -35,7 +35,7 @@ def difference(
     return b - a - measured
 
 
-def angle(
+def angle_misclosure(
     a: Float[Array, "3"],
     vertex: Float[Array, "3"],
     b: Float[Array, "3"],
@@ -52,7 +52,7 @@ def angle(
 DIFFERENCE = Kind(
     "coordinate differences", difference, ("point", "point"), AXES, "length", snooped="single"
 )
-ANGLE = Kind("angles", angle, ("point", "point", "point"), ("angle",), "angle")
+ANGLE = Kind("angles", angle_misclosure, ("point", "point", "point"), ("angle",), "angle")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -12,12 +12,14 @@ if TYPE_CHECKING:
     from jaxbundle.network.tables import Network
 
 
-def distance(a: Float[Array, "3"], b: Float[Array, "3"], observed: Scalar) -> Scalar:
+def distance_misclosure(a: Float[Array, "3"], b: Float[Array, "3"], measured: Scalar) -> Scalar:
     """The distance of two points minus the given one."""
-    return jnp.sqrt(jnp.sum((a - b) ** 2)) - observed
+    return jnp.sqrt(jnp.sum((a - b) ** 2)) - measured
 
 
-DISTANCES = Kind("distances", distance, ("point", "point"), ("d",), "length", snooped="single")
+DISTANCES = Kind(
+    "distances", distance_misclosure, ("point", "point"), ("d",), "length", snooped="single"
+)
 
 
 def declare_distances(network: "Network") -> list[ObservationSet]:

@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from jaxbundle.network.tables import Network
 
 
-def exterior(pose: Posed, observed: Float[Array, "6"]) -> Float[Array, "6"]:
+def exterior_misclosure(pose: Posed, prior: Float[Array, "6"]) -> Float[Array, "6"]:
     """Projection centre and ω, φ, κ (on the branch of the given ones) minus the given values
     [6]."""
-    angles = omega_phi_kappa_near(pose.rotation.matrix(), observed[3:])
-    return jnp.concatenate([jnp.stack(pose.centre), angles]) - observed
+    angles = omega_phi_kappa_near(pose.rotation.matrix(), prior[3:])
+    return jnp.concatenate([jnp.stack(pose.centre), angles]) - prior
 
 
 EXTERIOR_ORIENTATION = Kind(
-    "exterior orientation", exterior, ("image",), EXTERIOR, POSE_UNITS, snooped=""
+    "exterior orientation", exterior_misclosure, ("image",), EXTERIOR, POSE_UNITS, snooped=""
 )
 
 
@@ -93,8 +93,8 @@ class ExteriorPriors(ObservationTable):
 
     def columns(self, radians: float) -> dict:
         unit = np.array([1, 1, 1, radians, radians, radians])
-        is_given = np.isfinite(self.sigma)
-        value, sigma = (np.where(is_given, x, np.nan) / unit for x in (self.value, self.sigma))
+        has_sigma = np.isfinite(self.sigma)
+        value, sigma = (np.where(has_sigma, x, np.nan) / unit for x in (self.value, self.sigma))
         columns: dict[str, Any] = {"image": self.image}
         columns |= {name: value[:, k] for k, name in enumerate(EXTERIOR)}
         return columns | {f"s{name}": sigma[:, k] for k, name in enumerate(EXTERIOR)}

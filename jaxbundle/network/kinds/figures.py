@@ -59,33 +59,33 @@ DIRECTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z")
 ROUND = ("circle", "sphere", "cylinder")
 
 
-def on_plane(frame: Posed, point: Triple, observed: Scalar) -> Scalar:
-    return frame.ray(point)[2] - observed
+def on_plane(frame: Posed, point: Triple, measured: Scalar) -> Scalar:
+    return frame.ray(point)[2] - measured
 
 
-def on_line(frame: Posed, point: Triple, observed: Float[Array, "2"]) -> Float[Array, "2"]:
-    return jnp.stack(frame.ray(point)[:2]) - observed
+def on_line(frame: Posed, point: Triple, measured: Float[Array, "2"]) -> Float[Array, "2"]:
+    return jnp.stack(frame.ray(point)[:2]) - measured
 
 
 def on_circle(
-    frame: Posed, radius: Scalar, point: Triple, observed: Float[Array, "2"]
+    frame: Posed, radius: Scalar, point: Triple, measured: Float[Array, "2"]
 ) -> Float[Array, "2"]:
     x, y, z = frame.ray(point)
-    return jnp.stack([jnp.sqrt(x * x + y * y) - radius, z]) - observed
+    return jnp.stack([jnp.sqrt(x * x + y * y) - radius, z]) - measured
 
 
-def on_sphere(frame: Posed, radius: Scalar, point: Triple, observed: Scalar) -> Scalar:
-    return jnp.sqrt(sum(x * x for x in frame.ray(point))) - radius - observed
+def on_sphere(frame: Posed, radius: Scalar, point: Triple, measured: Scalar) -> Scalar:
+    return jnp.sqrt(sum(x * x for x in frame.ray(point))) - radius - measured
 
 
-def on_cylinder(frame: Posed, radius: Scalar, point: Triple, observed: Scalar) -> Scalar:
+def on_cylinder(frame: Posed, radius: Scalar, point: Triple, measured: Scalar) -> Scalar:
     x, y, _ = frame.ray(point)
-    return jnp.sqrt(x * x + y * y) - radius - observed
+    return jnp.sqrt(x * x + y * y) - radius - measured
 
 
-def in_shape(frame: Posed, point: Triple, observed: Float[Array, "3"]) -> Float[Array, "3"]:
+def in_shape(frame: Posed, point: Triple, measured: Float[Array, "3"]) -> Float[Array, "3"]:
     """A point in the frame of a shape of known coordinates."""
-    return jnp.stack(frame.ray(point)) - observed
+    return jnp.stack(frame.ray(point)) - measured
 
 
 RESIDUALS = {
@@ -126,13 +126,13 @@ class Figures(ObservationTable):
                 raise InputError(
                     f"{table.source(row)}: type is {show(word)}{did_you_mean(word, TYPES)}"
                 )
-        first_row: dict[str, int] = {}
+        first_rows: dict[str, int] = {}
         for row, name in enumerate(figures.figure):
-            earlier_row = first_row.setdefault(name, row)
-            if figures.type[row] != figures.type[earlier_row]:
+            first_row = first_rows.setdefault(name, row)
+            if figures.type[row] != figures.type[first_row]:
                 raise InputError(
                     f"{table.source(row)}: {name!r} is a {figures.type[row]} here, but a "
-                    f"{figures.type[earlier_row]} in {table.source(earlier_row)}"
+                    f"{figures.type[first_row]} in {table.source(first_row)}"
                 )
             if figures.type[row] not in ROUND and not np.isnan(figures.radius[row]):
                 raise InputError(f"{table.source(row)}: a {figures.type[row]} has no radius")
@@ -155,7 +155,7 @@ class Figures(ObservationTable):
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         point = rows_of(self.point, network.points)
         place = network.points.position - origin
-        exact = EXACT_SIGMA * across_rays(network)
+        exact = EXACT_SIGMA * sigma_across_rays(network)
         declared = [self._of_type(type, point, place, exact) for type in TYPES if type in self.type]
         return Contribution(*(sum(parts, ()) for parts in zip(*declared)))
 
@@ -169,16 +169,15 @@ class Figures(ObservationTable):
         rows = np.flatnonzero(np.array(self.type, dtype=object) == type)
         names, figure = np.unique(np.array(self.figure, dtype=object)[rows], return_inverse=True)
         members = [rows[figure == k] for k in range(len(names))]
-        for name, rows_of_figure in zip(names, members):
-            if len(np.unique(point[rows_of_figure])) < FEWEST[type]:
+        for name, figure_rows in zip(names, members):
+            if len(np.unique(point[figure_rows])) < FEWEST[type]:
                 raise InputError(
-                    f"{self.source(rows_of_figure[0])}: {type} {name!r} has {len(rows_of_figure)} "
-                    "usable points; "
-                    f"at least {FEWEST[type]} are needed"
+                    f"{self.source(figure_rows[0])}: {type} {name!r} has {len(figure_rows)} "
+                    f"usable points; at least {FEWEST[type]} are needed"
                 )
         centre, M, radius = (
             np.array(x)
-            for x in zip(*(fit(type, place[point[rows_of_figure]]) for rows_of_figure in members))
+            for x in zip(*(fit(type, place[point[figure_rows]]) for figure_rows in members))
         )
         q = np.array([np.asarray(quaternion_from_matrix(m)) for m in M])
         columns = MOVES[type]
@@ -196,7 +195,7 @@ class Figures(ObservationTable):
             observations = self._observe_points(type, (type,), (figure,), point[rows], sigma)
             return Contribution((frame,), (observations,), ((type, move_pose),))
         known_radius = np.array(
-            [np.nanmax([*self.radius[rows_of_figure], -1.0]) for rows_of_figure in members]
+            [np.nanmax([*self.radius[figure_rows], -1.0]) for figure_rows in members]
         )
         size = Table(
             f"radius of {type}",
@@ -207,13 +206,13 @@ class Figures(ObservationTable):
         )
         observations = []
         for has_radius in (False, True):
-            figures_of_case = np.flatnonzero((known_radius > 0)[figure] == has_radius)
-            if len(figures_of_case):
-                tables, touched_rows = (type, size.name), (figure[figures_of_case],) * 2
-                points_of_case, own_sigma = point[rows[figures_of_case]], sigma[figures_of_case]
+            selected = np.flatnonzero((known_radius > 0)[figure] == has_radius)
+            if len(selected):
+                tables, rows_of_tables = (type, size.name), (figure[selected],) * 2
+                point_rows, own_sigma = point[rows[selected]], sigma[selected]
                 observations.append(
                     self._observe_points(
-                        type, tables, touched_rows, points_of_case, own_sigma, not has_radius
+                        type, tables, rows_of_tables, point_rows, own_sigma, not has_radius
                     )
                 )
         actions = (type, move_pose), (size.name, scale_length)
@@ -275,14 +274,13 @@ class Shapes(ObservationTable):
         places = network.points.position - origin
         centre, rotation = [], []
         for k, name in enumerate(names):
-            rows_of_shape = np.flatnonzero(shape == k)
-            if len(rows_of_shape) < 3:
+            shape_rows = np.flatnonzero(shape == k)
+            if len(shape_rows) < 3:
                 raise InputError(
-                    f"{self.source(rows_of_shape[0])}: shape {name!r}: {len(rows_of_shape)} "
-                    "points, "
+                    f"{self.source(shape_rows[0])}: shape {name!r}: {len(shape_rows)} points, "
                     "at least 3 are needed"
                 )
-            X0, M = _place(self.place[rows_of_shape], places[point[rows_of_shape]])
+            X0, M = _fit_frame(self.place[shape_rows], places[point[shape_rows]])
             centre.append(X0)
             rotation.append(np.asarray(quaternion_from_matrix(M)))
         frame = Table(
@@ -292,13 +290,13 @@ class Shapes(ObservationTable):
             labels=list(names),
             parameters=DIRECTIONS,
         )
-        sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * sigma_across_rays(network))
         kind = Kind(KNOWN_SHAPES, in_shape, ("shape", "point"), ("x", "y", "z"), "length")
         observations = kind((shape, point), self.place, sigma=sigma)
         return Contribution((frame,), (observations,), (("shape", move_pose),))
 
 
-def _place(
+def _fit_frame(
     x: Float[np.ndarray, "n 3"], X: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """X0 and M of x = M·(X − X0), by Kabsch (1976)."""
@@ -309,7 +307,7 @@ def _place(
     return b - M.T @ a, M
 
 
-def across_rays(network: Network) -> float:
+def sigma_across_rays(network: Network) -> float:
     """The σ of a point across a ray, σ·s/c, median of all rays."""
     rays, images = network.observations, network.images
     shortest = []
@@ -317,9 +315,9 @@ def across_rays(network: Network) -> float:
         model = get_model(camera.model)
         shortest.append(min(abs(camera.parameters.get(p, 0.0)) for p in model.principal_distance))
     # σ·s/c: an image point's σ projected to the distance of the object point.
-    sight = network.points.position[rays.point] - images.position[rays.image]
+    ray_vectors = network.points.position[rays.point] - images.position[rays.image]
     c = np.array(shortest)[images.camera[rays.image]]
-    return float(np.median(np.linalg.norm(sight, axis=1) * rays.sigma.min(1) / c))
+    return float(np.median(np.linalg.norm(ray_vectors, axis=1) * rays.sigma.min(1) / c))
 
 
 def sigma_or_exact(table: Columns):

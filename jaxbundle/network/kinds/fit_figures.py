@@ -17,27 +17,27 @@ def fit(type: str, X: Float[np.ndarray, "n 3"]):
     if type == "line":
         return middle, _frame(Vt[0]), np.nan
     if type == "sphere":
-        centre, radius, _ = _circle(X - middle)
+        centre, radius, _ = _fit_circle(X - middle)
         return middle + centre, np.eye(3), radius
     if type == "circle":
-        return _about(Vt[2], X)[:3]
+        return _fit_about_axis(Vt[2], X)[:3]
     # The axis of a cylinder has no closed form: the best of 400 directions, 7° apart, from which an
     # adjustment converges; and of the principal axes, which long and short cylinders have.
     directions = (*Vt, *_hemisphere(400))
-    axis = min(directions, key=lambda n: _about(n, X)[3])
-    return _about(axis, X)[:3]
+    axis = min(directions, key=lambda n: _fit_about_axis(n, X)[3])
+    return _fit_about_axis(axis, X)[:3]
 
 
-def _about(
+def _fit_about_axis(
     axis: Float[np.ndarray, "3"], X: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float, float]:
     """The circle of points projected along an axis: origin, M, radius, RMS of its distances."""
     middle, M = X.mean(0), _frame(axis)
-    centre, radius, rms = _circle(((X - middle) @ M.T)[:, :2])
+    centre, radius, rms = _fit_circle(((X - middle) @ M.T)[:, :2])
     return middle + M[:2].T @ centre, M, radius, rms
 
 
-def _circle(x: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " d"], float, float]:
+def _fit_circle(x: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " d"], float, float]:
     """Centre, radius of a circle or a sphere (Kåsa 1976), and the RMS of the distances from it."""
     # |x − m|² = r² is linear in m and r² − m²: 2x·m + (r² − m²) = x². Biased for short arcs, but
     # start values need no more.
@@ -45,8 +45,8 @@ def _circle(x: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " d"], float
     *centre, constant = np.linalg.lstsq(A, (x**2).sum(1), rcond=None)[0]
     centre = np.array(centre)
     radius = np.sqrt(max(constant + centre @ centre, 0.0))
-    difference = np.linalg.norm(x - centre, axis=1) - radius
-    return centre, radius, float(np.sqrt((difference**2).mean()))
+    residual = np.linalg.norm(x - centre, axis=1) - radius
+    return centre, radius, float(np.sqrt((residual**2).mean()))
 
 
 def _frame(z: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -27,14 +27,14 @@ class Rigid(NamedTuple):
     R: Float[np.ndarray, "*n 3 3"]
     t: Float[np.ndarray, "*n 3"]
 
-    def after(self, inner: "Rigid") -> "Rigid":
+    def compose(self, other: "Rigid") -> "Rigid":
         """This one after the other."""
-        return Rigid(self.R @ inner.R, (self.R @ inner.t[..., None])[..., 0] + self.t)
+        return Rigid(self.R @ other.R, (self.R @ other.t[..., None])[..., 0] + self.t)
 
     @property
     def inverse(self) -> "Rigid":
-        transposed = np.swapaxes(self.R, -1, -2)
-        return Rigid(transposed, -(transposed @ self.t[..., None])[..., 0])
+        transpose = np.swapaxes(self.R, -1, -2)
+        return Rigid(transpose, -(transpose @ self.t[..., None])[..., 0])
 
 
 def rotation_vectors(R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
@@ -53,18 +53,18 @@ def motions(A: Rigid, B: Rigid) -> tuple[Rigid, Rigid]:
     n = len(A.t)
     steps = np.unique(np.linspace(1, n - 1, min(n - 1, MOST_PARTNERS)).astype(int))
     pairs = [np.arange(n - step) for step in steps]
-    i = np.concatenate([begin + step for begin, step in zip(pairs, steps)])
+    i = np.concatenate([start + step for start, step in zip(pairs, steps)])
     j = np.concatenate(pairs)
-    motions_of = lambda T: Rigid(T.R[j], T.t[j]).inverse.after(Rigid(T.R[i], T.t[i]))
-    return motions_of(A), motions_of(B)
+    relative_motion = lambda T: Rigid(T.R[j], T.t[j]).inverse.compose(Rigid(T.R[i], T.t[i]))
+    return relative_motion(A), relative_motion(B)
 
 
 class Turns(NamedTuple):
     """How far the hand turns between its poses: RMS about the main axis, and about any other one,
     radians; the main axis in the frame of the hand."""
 
-    most: float
-    across: float
+    about_axis: float
+    across_axis: float
     axis: Float[np.ndarray, "3"]
 
 
@@ -72,37 +72,37 @@ def turns(A: Rigid) -> Turns:
     """About which axes a hand turns."""
     alpha = rotation_vectors(motions(A, A)[0].R)
     size, axes = np.linalg.eigh(alpha.T @ alpha / max(len(alpha), 1))
-    largest_turn, second_turn = np.sqrt(np.maximum(size[::-1][:2], 0.0))
+    about_axis, across_axis = np.sqrt(np.maximum(size[::-1][:2], 0.0))
     axis = axes[:, -1]
     return Turns(
-        float(largest_turn), float(second_turn), axis if axis[np.abs(axis).argmax()] > 0 else -axis
+        float(about_axis), float(across_axis), axis if axis[np.abs(axis).argmax()] > 0 else -axis
     )
 
 
 def solve(A: Rigid, B: Rigid) -> tuple[Rigid, Rigid, float]:
     """X, Y, and the scale by which lengths of B are multiplied to be those of A (1 is expected
     where B has its own)."""
-    hand, camera = motions(A, B)
-    alpha, beta = rotation_vectors(hand.R), rotation_vectors(camera.R)
-    turned = np.linalg.norm(alpha, axis=1)
-    good = turned < LARGEST_TURN
+    hand_motions, camera_motions = motions(A, B)
+    alpha, beta = rotation_vectors(hand_motions.R), rotation_vectors(camera_motions.R)
+    turn_angle = np.linalg.norm(alpha, axis=1)
+    good = turn_angle < LARGEST_TURN
     good = good if good.any() else np.ones_like(good)
     R = nearest_rotation(alpha[good].T @ beta[good])
     # (R_A − 1)·t_X − s·R_X·t_B = −t_A
-    eye, scaled = hand.R - np.eye(3), -(R @ camera.t.T).T[..., None]
+    eye, scaled = hand_motions.R - np.eye(3), -(R @ camera_motions.t.T).T[..., None]
     rows = np.concatenate([eye, scaled], 2).reshape(-1, 4)
-    *_, scale = np.linalg.lstsq(rows, -hand.t.ravel())[0]
-    t = np.linalg.lstsq(eye.reshape(-1, 3), (-scaled[..., 0] - hand.t).ravel())[0]
+    *_, scale = np.linalg.lstsq(rows, -hand_motions.t.ravel())[0]
+    t = np.linalg.lstsq(eye.reshape(-1, 3), (-scaled[..., 0] - hand_motions.t).ravel())[0]
     X = Rigid(R, t)
     return X, other_side(A, X, B), float(scale)
 
 
 def other_side(A: Rigid, X: Rigid, B: Rigid) -> Rigid:
     """Y of A·X = Y·B, the mean over all poses."""
-    Y = A.after(X).after(B.inverse)
+    Y = A.compose(X).compose(B.inverse)
     R = nearest_rotation(Y.R.sum(0))
     # Of the places of B, not of its far origin.
-    t = (A.after(X).t - B.t @ R.T).mean(0)
+    t = (A.compose(X).t - B.t @ R.T).mean(0)
     return Rigid(R, t)
 
 

@@ -34,8 +34,8 @@ class ImagePoint:
     model: str | cameras.CameraModel
     domain: str
 
-    def __call__(self, *blocks: Any) -> Change:
-        *poses, interior, ray, xy = blocks
+    def __call__(self, *blocks_and_measured: Any) -> Change:
+        *poses, interior, ray, xy = blocks_and_measured
         for pose in poses:
             ray = pose.ray(ray)
         return cameras.residual(cameras.get_model(self.model), self.domain, interior, ray, xy)
@@ -47,8 +47,8 @@ class ColumnsOfImagePoint:
 
     model: str | cameras.CameraModel
 
-    def __call__(self, *blocks: Any) -> Change:
-        *poses, p, ray, _ = blocks
+    def __call__(self, *blocks_and_measured: Any) -> Change:
+        *poses, p, ray, _ = blocks_and_measured
         model = cameras.get_model(self.model)
         return not_none(model.local).columns(p, *model.ideal(p, *_transform_ray(poses, ray)))
 
@@ -59,8 +59,8 @@ class LocalImagePoint:
 
     model: str | cameras.CameraModel
 
-    def __call__(self, *blocks: Any) -> Change:
-        *poses, p, ray, columns, values, xy = blocks
+    def __call__(self, *blocks_and_measured: Any) -> Change:
+        *poses, p, ray, columns, values, xy = blocks_and_measured
         model = cameras.get_model(self.model)
         ideal = model.ideal(p, *_transform_ray(poses, ray))
         x, y = not_none(model.local).distort(p, columns, values, *ideal)
@@ -107,14 +107,14 @@ def image_points(
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
     "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: for
     cameras with a rolling shutter; `refraction`: through interfaces."""
-    tables_between = (VELOCITIES, READ_OUT) if moving else ()
+    extra_tables = (VELOCITIES, READ_OUT) if moving else ()
     if refraction is not None:
-        tables_between = (refraction.table, MEDIA)
-    tables = (*poses, *tables_between, camera, "point")
-    is_only_table = camera == "camera"
+        extra_tables = (refraction.table, MEDIA)
+    tables = (*poses, *extra_tables, camera, "point")
+    has_one_model = camera == "camera"
     name = (
         "image coordinates"
-        if is_only_table
+        if has_one_model
         else f"image coordinates of {cameras.get_model(model).name}"
     )
     residual: Any = (MovingImagePoint if moving else ImagePoint)(model, domain)
@@ -123,7 +123,7 @@ def image_points(
     # A spline of hundreds of parameters: an image point depends on a few of them, and only those
     # get derivatives and blocks (`leastsquares.equations.local`).
     formula, local = cameras.get_model(model).local, None
-    if formula is not None and domain == "measured" and not tables_between:
+    if formula is not None and domain == "measured" and not extra_tables:
         local = Local(
             tables.index(camera), formula.number, ColumnsOfImagePoint(model), LocalImagePoint(model)
         )
@@ -158,14 +158,14 @@ def declare_image_points(
             moving=line is not None,
             refraction=refraction,
         )
-        rows_between = () if line is None else (rays.image, camera)
+        extra_rows = () if line is None else (rays.image, camera)
         if interfaces is not None:
-            rows_between = (interfaces.rows_of_cameras(network)[camera],) * 2
-        touched_rows = (rays.image, *rows_between, row_of_camera[camera], rays.point)
+            extra_rows = (interfaces.rows_of_cameras(network)[camera],) * 2
+        rows_of_tables = (rays.image, *extra_rows, row_of_camera[camera], rays.point)
         measured = rays.xy[rows] if line is None else (rays.xy[rows], line[rows])
         sets.append(
             kind(
-                tuple(index[rows] for index in touched_rows),
+                tuple(index[rows] for index in rows_of_tables),
                 measured,
                 sigma=rays.sigma[rows],
                 name=table.image_set,

@@ -75,19 +75,19 @@ class Refraction:
         z = interface.rotation.apply_inverse((0.0, 0.0, 1.0))
         normal = tuple(-x for x in z)
         if self.table == PORT:
-            ray, from_centre = pose.ray(point), interface.centre
-            distance = sum(n * x for n, x in zip(normal, from_centre))
+            ray, plane_point = pose.ray(point), interface.centre
+            distance = sum(n * x for n, x in zip(normal, plane_point))
             return refract_flat(ray, normal, distance, thickness, indices)
         ray = tuple(a - b for a, b in zip(point, pose.centre))
-        from_centre = (a - b for a, b in zip(interface.centre, pose.centre))
-        distance = sum(n * x for n, x in zip(normal, from_centre))
+        plane_point = (a - b for a, b in zip(interface.centre, pose.centre))
+        distance = sum(n * x for n, x in zip(normal, plane_point))
         return pose.rotation.apply(refract_flat(ray, normal, distance, thickness, indices))
 
 
-def given_plane(frame: Posed, observed: tuple[Array, Array]) -> Float[Array, "3"]:
+def plane_minus_given(frame: Posed, prior: tuple[Array, Array]) -> Float[Array, "3"]:
     """The shift of a plane along its normal, and its tilts, against the given point and rotation.
     Of the plane alone, not of where its frame is on it, which has no derivative."""
-    X0, M = observed
+    X0, M = prior
     z = jnp.stack(frame.rotation.apply_inverse((0.0, 0.0, 1.0)))
     x, y, _ = M @ z
     return jnp.stack([z @ (jnp.stack(frame.centre) - X0), y, -x])
@@ -137,8 +137,8 @@ class Interfaces(ObservationTable):
         value = np.where(np.isnan(value), NO_INTERFACE, value)
         # A layer of thickness 0 has the index behind it: its two planes are one.
         window, thickness = COLUMNS.index("index_window"), COLUMNS.index("thickness")
-        single = value[:, thickness] == 0
-        value[single, window] = value[single, COLUMNS.index("index")]
+        is_single_plane = value[:, thickness] == 0
+        value[is_single_plane, window] = value[is_single_plane, COLUMNS.index("index")]
         return dataclasses.replace(interfaces, value=value)
 
     def _check_row(self, row: int) -> None:
@@ -155,8 +155,8 @@ class Interfaces(ObservationTable):
                 "expected both or neither"
             )
         # σ of what an interface of this type does not have
-        lacking = ("radius", "sX", "sY") if type == "flat" else (*TILT, "somega", "sphi")
-        for name in lacking:
+        absent_names = ("radius", "sX", "sY") if type == "flat" else (*TILT, "somega", "sphi")
+        for name in absent_names:
             if has_value.get(name, False) or has_sigma.get(name[1:], False) and name[0] == "s":
                 raise InputError(f"{where}: a {type} interface has no {name}")
         for name in ("radius", "index_window", "index_camera", "index", "thickness"):
@@ -187,10 +187,10 @@ class Interfaces(ObservationTable):
             raise InputError(f"{where}: camera is missing: a dome is before one camera")
         if not radius > 0:
             raise InputError(f"{where}: radius is missing, of the inner sphere, positive")
-        distance = np.linalg.norm(np.nan_to_num(self.value[row, :3]))
-        if distance >= radius:
+        offset = np.linalg.norm(np.nan_to_num(self.value[row, :3]))
+        if offset >= radius:
             raise InputError(
-                f"{where}: the camera is {distance:g} from the centre of its dome, outside of the "
+                f"{where}: the camera is {offset:g} from the centre of its dome, outside of the "
                 f"radius {radius:g}; X, Y, Z are relative to the camera"
             )
 
@@ -207,28 +207,28 @@ class Interfaces(ObservationTable):
     def columns(self, radians: float) -> dict[str, Sequence[Any]]:
         unit = np.where([name in TILT for name in COLUMNS], radians, 1.0)
         columns: dict = {"interface": self.interface, "type": self.type, "camera": self.camera}
-        flat = np.array([type == "flat" for type in self.type])
-        plain = self.value[:, COLUMNS.index("thickness")] == 0
+        is_flat = np.array([type == "flat" for type in self.type])
+        is_single_plane = self.value[:, COLUMNS.index("thickness")] == 0
         for k, name in enumerate(COLUMNS):
-            lacking = (plain & (name in ("index_window", "thickness"))) | (
-                flat if name == "radius" else ~flat & (name in TILT)
+            is_absent = (is_single_plane & (name in ("index_window", "thickness"))) | (
+                is_flat if name == "radius" else ~is_flat & (name in TILT)
             )
-            columns[name] = np.where(lacking, np.nan, self.value[:, k] / unit[k])
+            columns[name] = np.where(is_absent, np.nan, self.value[:, k] / unit[k])
         for k, name in enumerate(COLUMNS):
             sigma = (self.sigma[:, k] / unit[k]).tolist()
             columns[f"s{name}"] = [x if np.isfinite(x) else "free" if x > 0 else x for x in sigma]
         return {name: x for name, x in columns.items() if not _is_empty(x)}
 
-    def at(self, unknowns: Mapping[str, Mapping], radians: float) -> "Interfaces":
+    def held_at(self, unknowns: Mapping[str, Mapping], radians: float) -> "Interfaces":
         """The interfaces held at the values of a result (`Adjustment.further_unknowns`)."""
         geometry, media = (unknowns[name] for name in (self._table(0), MEDIA))
         value = self.value.copy()
         for row, name in enumerate(self.interface):
-            adjusted = {k.removesuffix("0"): v["value"] for k, v in geometry[name].items()}
-            adjusted |= {k: v["value"] for k, v in media[name].items()}
+            estimates = {k.removesuffix("0"): v["value"] for k, v in geometry[name].items()}
+            estimates |= {k: v["value"] for k, v in media[name].items()}
             scale = {k: radians if k in TILT else 1.0 for k in COLUMNS}
             value[row] = [
-                adjusted[k] * scale[k] if k in adjusted else old
+                estimates[k] * scale[k] if k in estimates else old
                 for k, old in zip(COLUMNS, value[row])
             ]
         return dataclasses.replace(self, value=value, sigma=np.full_like(self.sigma, np.nan))
@@ -236,7 +236,7 @@ class Interfaces(ObservationTable):
     def __len__(self) -> int:
         return len(self.interface)
 
-    def _present(self, network: Network) -> np.ndarray:
+    def _included_rows(self, network: Network) -> np.ndarray:
         known_ids = {"", *(camera.id for camera in network.cameras)}
         return np.array([id in known_ids for id in self.camera], bool)
 
@@ -264,12 +264,11 @@ class Interfaces(ObservationTable):
                 + ("in object space" if tables[0] == SURFACE else "before one camera")
                 + "; expected one (a window is one interface with a thickness)"
             )
-        for other_kind in network.further:
-            if other_kind.TABLE in ("velocities", "edges"):
+        for further_table in network.further:
+            if further_table.TABLE in ("velocities", "edges"):
                 raise InputError(
-                    f"{self.source.name}: {other_kind.TABLE} are for straight rays; expected a "
-                    "network "
-                    f"with either {self.TABLE} or {other_kind.TABLE}"
+                    f"{self.source.name}: {further_table.TABLE} are for straight rays; expected "
+                    f"a network with either {self.TABLE} or {further_table.TABLE}"
                 )
 
     def _table(self, row: int) -> str:
@@ -293,19 +292,19 @@ class Interfaces(ObservationTable):
         neglect that they do not meet in one point. NaN beyond total reflection."""
         for row in [row for row, id in enumerate(self.camera) if id == camera]:
             value = dict(zip(COLUMNS, self.value[row].tolist()))
-            point_on_port, normal = np.zeros_like(rays), self._normal(row)
+            intersection, normal = np.zeros_like(rays), self._normal(row)
             for radius, n, n_next in (
                 (value["radius"], value["index_camera"], value["index_window"]),
                 (value["radius"] + value["thickness"], value["index_window"], value["index"]),
             ):
                 if self.type[row] == "dome":
-                    to_centre = self.value[row, :3] - point_on_port
-                    distance_along = (rays * to_centre).sum(1)
-                    chord = distance_along**2 - (to_centre**2).sum(1) + radius**2
-                    point_on_port = (
-                        point_on_port + rays * (distance_along + np.sqrt(chord))[:, None]
+                    to_centre = self.value[row, :3] - intersection
+                    projection = (rays * to_centre).sum(1)
+                    discriminant = projection**2 - (to_centre**2).sum(1) + radius**2
+                    intersection = (
+                        intersection + rays * (projection + np.sqrt(discriminant))[:, None]
                     )
-                    normal = (point_on_port - self.value[row, :3]) / radius
+                    normal = (intersection - self.value[row, :3]) / radius
                 rays = _refract(rays, normal, n / n_next)
         return rays
 
@@ -368,8 +367,8 @@ def _observe(
         units,
         snooped="",
     )
-    sigma_observed = np.where(np.isnan(sigma[rows]), np.inf, sigma[rows])
-    return (kind((rows,), np.asarray(table.value)[rows], sigma=sigma_observed),)
+    prior_sigma = np.where(np.isnan(sigma[rows]), np.inf, sigma[rows])
+    return (kind((rows,), np.asarray(table.value)[rows], sigma=prior_sigma),)
 
 
 def _planes(
@@ -379,18 +378,18 @@ def _planes(
     labels: Sequence[str],
 ) -> tuple[Table, tuple[ObservationSet, ...]]:
     """The table of flat interfaces, and the observations of those that have a σ."""
-    X0, sigma_of_plane = value[:, :3], sigma[:, 2:5]
+    X0, plane_sigma = value[:, :3], sigma[:, 2:5]
     angles = np.pad(value[:, 3:5], ((0, 0), (0, 1)))
     M = np.stack([np.asarray(matrix_from_omega_phi_kappa(a)) for a in angles])
     q = np.stack([np.asarray(quaternion_from_matrix(m)) for m in M])
-    free = ~np.isnan(sigma_of_plane)
+    free = ~np.isnan(plane_sigma)
     table = Table(name, PoseValue(X0, q), Frame((2, 3, 4)), free, labels, PLANE, name)
-    rows = np.flatnonzero(np.isfinite(sigma_of_plane).any(1))
+    rows = np.flatnonzero(np.isfinite(plane_sigma).any(1))
     if not len(rows):
         return table, ()
-    kind = Kind(f"prior of {name}", given_plane, (name,), PLANE, PLANE_PRIOR, snooped="")
-    sigma_of_plane = np.where(np.isnan(sigma_of_plane[rows]), np.inf, sigma_of_plane[rows])
-    return table, (kind((rows,), (X0[rows], M[rows]), sigma=sigma_of_plane),)
+    kind = Kind(f"prior of {name}", plane_minus_given, (name,), PLANE, PLANE_PRIOR, snooped="")
+    plane_sigma = np.where(np.isnan(plane_sigma[rows]), np.inf, plane_sigma[rows])
+    return table, (kind((rows,), (X0[rows], M[rows]), sigma=plane_sigma),)
 
 
 def _scale_thicknesses(motion: Float[Array, "7"], value: Float[Array, " n"]) -> Float[Array, " n"]:

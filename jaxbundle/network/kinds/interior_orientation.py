@@ -36,14 +36,14 @@ def declare_interior_orientation(
         for camera in network.cameras
     ]
     for table in tables:
-        own_cameras = [network.cameras[c] for c in table.cameras]
+        table_cameras = [network.cameras[c] for c in table.cameras]
         sigma = np.array(
             [
                 [
                     camera.sigma.get(p, np.inf) if p in camera.free else np.inf
                     for p in table.parameters
                 ]
-                for camera in own_cameras
+                for camera in table_cameras
             ]
         )
         rows = np.flatnonzero(np.isfinite(sigma).any(1))

@@ -53,8 +53,8 @@ class OnLine:
         n = cross(pose.ray(line.centre), direction)
         r = cameras.image_ray(model, interior, *xy)
         c = interior[model.parameters.index(model.principal_distance[0])]
-        length = (n[0] ** 2 + n[1] ** 2) ** 0.5
-        return (c * sum(a * b for a, b in zip(n, r)) / (r[2] * length),)
+        normal_length = (n[0] ** 2 + n[1] ** 2) ** 0.5
+        return (c * sum(a * b for a, b in zip(n, r)) / (r[2] * normal_length),)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,8 +97,8 @@ class Edges(ObservationTable):
         sigma = np.where(np.isnan(self.sigma), np.median(network.observations.sigma), self.sigma)
         unit = network.image_unit if network.image_unit in ("mm", "px") else "mm"
         sigma_xy = np.stack([self.sigma] * 2, 1)
-        xy, own_sigma = from_image_unit(network.cameras, camera, self.xy, sigma_xy, unit)
-        sigma = np.where(np.isnan(self.sigma), sigma, own_sigma[:, 0])
+        xy, converted_sigma = from_image_unit(network.cameras, camera, self.xy, sigma_xy, unit)
+        sigma = np.where(np.isnan(self.sigma), sigma, converted_sigma[:, 0])
         names, line = np.unique(np.array(self.line, dtype=object), return_inverse=True)
         start = [
             self._start(network, origin, np.flatnonzero(line == k), image, xy)
@@ -144,11 +144,11 @@ class Edges(ObservationTable):
         """The intersection of the planes of the images: a point, and a rotation whose last row is
         the direction. `min_angle` between the planes, radians: closer ones intersect in a line
         whose direction is mostly noise."""
-        normals, through = [], []
+        normals, plane_offsets = [], []
         for i in np.unique(image[rows]):
-            rows_of_image = rows[image[rows] == i]
+            line_rows = rows[image[rows] == i]
             # Two points of the line in an image give a plane; one point only helps the adjustment.
-            if len(rows_of_image) < 2:
+            if len(line_rows) < 2:
                 continue
             c = network.images.camera[i]
             table = next(t for t in camera_tables(network.cameras) if c in t.cameras)
@@ -156,15 +156,13 @@ class Edges(ObservationTable):
             r = np.stack(
                 [
                     np.asarray(x)
-                    for x in cameras.image_ray(
-                        cameras.get_model(table.model), p, *xy[rows_of_image].T
-                    )
+                    for x in cameras.image_ray(cameras.get_model(table.model), p, *xy[line_rows].T)
                 ],
                 1,
             )
             M = np.asarray(matrix_from_omega_phi_kappa(network.images.angles[i]))
             normals.append(np.linalg.svd(r @ M)[2][-1])
-            through.append(normals[-1] @ (network.images.position[i] - origin))
+            plane_offsets.append(normals[-1] @ (network.images.position[i] - origin))
         n = np.array(normals).reshape(-1, 3)
         _, size, Vt = np.linalg.svd(n if len(n) else np.zeros((1, 3)))
         if len(n) < 2 or size[1] < min_angle:
@@ -172,6 +170,6 @@ class Edges(ObservationTable):
                 f"{self.source(rows[0])}: line {self.line[rows[0]]!r} needs two points in each of "
                 "two images that do not see it in one plane"
             )
-        A = np.linalg.lstsq(n, np.array(through), rcond=min_angle)[0]
+        A = np.linalg.lstsq(n, np.array(plane_offsets), rcond=min_angle)[0]
         y = np.cross(Vt[2], Vt[0])
         return A, np.asarray(quaternion_from_matrix(np.stack([Vt[0], y, Vt[2]])))

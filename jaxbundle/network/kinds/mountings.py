@@ -38,37 +38,41 @@ def turn_of(D: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return 0.5 * jnp.stack([D[1, 2] - D[2, 1], D[2, 0] - D[0, 2], D[0, 1] - D[1, 0]])
 
 
-def given_mounting(mounting: Posed, observed: Float[Array, "6"]) -> Float[Array, "6"]:
+def mounting_minus_given(mounting: Posed, measured: Float[Array, "6"]) -> Float[Array, "6"]:
     """Position and rotation of a mounting minus the given position and ω, φ, κ; the rotation as a
     vector about the axes of the camera, which has no singular attitude."""
-    turn = turn_of(mounting.rotation.matrix() @ matrix_from_omega_phi_kappa(observed[3:]).T)
-    return jnp.concatenate([jnp.stack(mounting.centre) - observed[:3], turn])
+    turn = turn_of(mounting.rotation.matrix() @ matrix_from_omega_phi_kappa(measured[3:]).T)
+    return jnp.concatenate([jnp.stack(mounting.centre) - measured[:3], turn])
 
 
-def given_base(camera_a: Posed, camera_b: Posed, length: Float[Array, ""]) -> Float[Array, ""]:
+def base_minus_given(
+    first_pose: Posed, second_pose: Posed, length: Float[Array, ""]
+) -> Float[Array, ""]:
     """The distance of two cameras of a rig minus the given one."""
-    return jnp.linalg.norm(jnp.stack(camera_a.centre) - jnp.stack(camera_b.centre)) - length
+    return jnp.linalg.norm(jnp.stack(first_pose.centre) - jnp.stack(second_pose.centre)) - length
 
 
-GIVEN_MOUNTINGS = Kind("given mountings", given_mounting, (MOUNTING,), AXES, POSE_UNITS, snooped="")
-BASES = Kind("bases", given_base, (MOUNTING, MOUNTING), ("length",), "length", snooped="")
+GIVEN_MOUNTINGS = Kind(
+    "given mountings", mounting_minus_given, (MOUNTING,), AXES, POSE_UNITS, snooped=""
+)
+BASES = Kind("bases", base_minus_given, (MOUNTING, MOUNTING), ("length",), "length", snooped="")
 
 
 class GivenMounting(NamedTuple):
     """What is known of a mounting: position, and angles in radians, None where it is not given;
     `sigma` of position and rotation vector, infinite where nothing is observed, or their
-    `covariance`; `held`: position, angles."""
+    `covariance`; `is_held`: position, angles."""
 
     position: Float[np.ndarray, "3"] | None
     angles: Float[np.ndarray, "3"] | None
     sigma: Float[np.ndarray, "6"]
     covariance: Float[np.ndarray, "6 6"] | None
-    held: tuple[bool, bool]
+    is_held: tuple[bool, bool]
 
     @property
     def length(self) -> float | None:
         """The base to the reference camera; None if it is not determined."""
-        is_known = self.held[0] or np.isfinite(self.sigma[:3]).all()
+        is_known = self.is_held[0] or np.isfinite(self.sigma[:3]).all()
         length = 0.0 if self.position is None or not is_known else np.linalg.norm(self.position)
         return float(length) if length > 0 else None
 
@@ -81,47 +85,51 @@ class Base(NamedTuple):
     sigma: float
 
 
-def read_mountings(
-    section: str, section_of_cameras: Any, radians: float
-) -> dict[str, GivenMounting]:
+def read_mountings(section: str, settings: Any, radians: float) -> dict[str, GivenMounting]:
     """The given mountings by camera; `radians` per angle unit.
 
     **Raises:** `InputError`."""
-    if not isinstance(section_of_cameras, Mapping):
+    if not isinstance(settings, Mapping):
         raise InputError(
-            f"[{section}]: mounting is {show(section_of_cameras)}; expected what is known of the "
+            f"[{section}]: mounting is {show(settings)}; expected what is known of the "
             "mounting of each camera, such as mounting.right = { position = [0.5, 0, 0] }"
         )
     return {
-        name: _read_mounting(f"{section}.mounting.{name}", entry, radians)
-        for name, entry in section_of_cameras.items()
+        name: _read_mounting(f"{section}.mounting.{name}", mounting, radians)
+        for name, mounting in settings.items()
     }
 
 
-def _read_mounting(section: str, entry: Any, radians: float) -> GivenMounting:
-    check_settings(section, entry, KEYS)
+def _read_mounting(section: str, settings: Any, radians: float) -> GivenMounting:
+    check_settings(section, settings, KEYS)
     unit = np.repeat([1.0, radians], 3)
-    position = numbers(section, "position", entry["position"], 3) if "position" in entry else None
-    angles = numbers(section, "angles", entry["angles"], 3) * radians if "angles" in entry else None
+    position = (
+        numbers(section, "position", settings["position"], 3) if "position" in settings else None
+    )
+    angles = (
+        numbers(section, "angles", settings["angles"], 3) * radians
+        if "angles" in settings
+        else None
+    )
     if position is None and angles is None:
         raise InputError(f"[{section}]: give position, angles, or both")
-    if "covariance" in entry:
-        if {"sigma_position", "sigma_angle"} & {*entry}:
+    if "covariance" in settings:
+        if {"sigma_position", "sigma_angle"} & {*settings}:
             raise InputError(f"[{section}]: give covariance, or sigma_position and sigma_angle")
         if angles is None or position is None:
             raise InputError(f"[{section}]: covariance is of position and angles; give both")
-        C = _covariance(section, entry["covariance"]) * np.outer(unit, unit)
+        C = _covariance(section, settings["covariance"]) * np.outer(unit, unit)
         C = _of_rotation_vector(C, angles)
         return GivenMounting(position, angles, np.sqrt(np.diag(C)), C, (False, False))
     sigma = np.full(6, np.inf)
     is_held = []
     for k, (name, value) in enumerate((("position", position), ("angle", angles))):
         key = f"sigma_{name}"
-        if key in entry and value is None:
+        if key in settings and value is None:
             raise InputError(f"[{section}]: {key} without {'position' if not k else 'angles'}")
-        is_held.append(value is not None and key not in entry)
-        if key in entry:
-            sigma[3 * k : 3 * k + 3] = _sigmas(section, key, entry[key]) * unit[3 * k]
+        is_held.append(value is not None and key not in settings)
+        if key in settings:
+            sigma[3 * k : 3 * k + 3] = _sigmas(section, key, settings[key]) * unit[3 * k]
     return GivenMounting(position, angles, sigma, None, (is_held[0], is_held[1]))
 
 
@@ -167,25 +175,25 @@ def _of_rotation_vector(
     return J @ C @ J.T
 
 
-def read_bases(section: str, entries: Any) -> tuple[Base, ...]:
+def read_bases(section: str, settings: Any) -> tuple[Base, ...]:
     """The given bases.
 
     **Raises:** `InputError`."""
-    if not isinstance(entries, Sequence) or isinstance(entries, str):
+    if not isinstance(settings, Sequence) or isinstance(settings, str):
         raise InputError(
-            f"[{section}]: bases is {show(entries)}; expected a list, such as "
+            f"[{section}]: bases is {show(settings)}; expected a list, such as "
             '[{ cameras = ["left", "right"], length = 0.5, sigma = 0.001 }]'
         )
     bases = []
-    for k, entry in enumerate(entries, 1):
+    for k, base in enumerate(settings, 1):
         where = f"{section}.bases, {k}"
-        check_settings(where, entry, ("cameras", "length", "sigma"))
-        cameras = entry.get("cameras")
+        check_settings(where, base, ("cameras", "length", "sigma"))
+        cameras = base.get("cameras")
         pair = isinstance(cameras, list | tuple) and len(cameras) == 2
         if not pair or not all(isinstance(c, str) for c in cameras) or cameras[0] == cameras[1]:
             raise InputError(f"[{where}]: cameras is {show(cameras)}; expected two names")
         length, sigma = (
-            positive(f"[{where}]: {key}", entry.get(key, np.nan)) for key in ("length", "sigma")
+            positive(f"[{where}]: {key}", base.get(key, np.nan)) for key in ("length", "sigma")
         )
         bases.append(Base((cameras[0], cameras[1]), length, sigma))
     return tuple(bases)
@@ -198,23 +206,23 @@ def observe_mountings(
     independent, and those with a covariance."""
     sets = []
     for name, correlated in (("given mountings", False), ("correlated mountings", True)):
-        rows_and_mountings = [
+        selected = [
             (row, mounting)
             for row, mounting in zip(rows, mountings)
             if (mounting.covariance is not None) == correlated and np.isfinite(mounting.sigma).any()
         ]
-        if not rows_and_mountings:
+        if not selected:
             continue
-        rows_observed, mountings_observed = zip(*rows_and_mountings)
-        measured = np.stack([_as_measured(mounting) for mounting in mountings_observed])
+        mounting_rows, selected_mountings = zip(*selected)
+        measured = np.stack([_as_measured(mounting) for mounting in selected_mountings])
         uncertainty: dict[str, Any] = {
-            "sigma": np.stack([mounting.sigma for mounting in mountings_observed])
+            "sigma": np.stack([mounting.sigma for mounting in selected_mountings])
         }
         if correlated:
             uncertainty = {
-                "covariance": np.stack([mounting.covariance for mounting in mountings_observed])
+                "covariance": np.stack([mounting.covariance for mounting in selected_mountings])
             }
-        sets.append(GIVEN_MOUNTINGS((np.array(rows_observed),), measured, name=name, **uncertainty))
+        sets.append(GIVEN_MOUNTINGS((np.array(mounting_rows),), measured, name=name, **uncertainty))
     return sets
 
 

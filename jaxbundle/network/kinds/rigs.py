@@ -30,7 +30,7 @@ from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Pose, Posed, PoseValue
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.kinds.base import POSE_UNITS, Contribution, ObservationTable, check_settings
-from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays
+from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_across_rays
 from jaxbundle.network.kinds.mountings import (
     AXES,
     BASES,
@@ -51,24 +51,24 @@ KEYS = ("reference", "sigma_position", "sigma_angle", "mounting", "bases")
 
 
 def mounting_misclosure(
-    pose_a: Posed,
-    pose_b: Posed,
-    mounting_of_one: Posed,
-    mounting_of_other: Posed,
-    observed: Float[Array, "6"],
+    first_pose: Posed,
+    second_pose: Posed,
+    first_mounting: Posed,
+    second_mounting: Posed,
+    measured: Float[Array, "6"],
 ) -> Float[Array, "6"]:
     """Difference of position and rotation of the reference camera derived from two cameras, in the
     frame of the first; the rotation as a vector. The reference has no mounting.
     """
-    R1, R2 = mounting_of_one.rotation.matrix(), mounting_of_other.rotation.matrix()
-    M1, M2 = pose_a.rotation.matrix(), pose_b.rotation.matrix()
+    R1, R2 = first_mounting.rotation.matrix(), second_mounting.rotation.matrix()
+    M1, M2 = first_pose.rotation.matrix(), second_pose.rotation.matrix()
     # Both cameras give the rotation of the reference camera, M_ref = Rᵀ·M, and its place. The
     # difference is symmetric in them and needs no image of the reference at this epoch.
-    base1, base2 = R1.T @ M1, R2.T @ M2
-    base_in_space = jnp.stack(pose_b.centre) - jnp.stack(pose_a.centre)
-    t1, t2 = jnp.stack(mounting_of_one.centre), jnp.stack(mounting_of_other.centre)
-    shift = base1 @ base_in_space - (t2 - t1)
-    return jnp.concatenate([shift, turn_of(base2 @ base1.T)]) - observed
+    M_ref1, M_ref2 = R1.T @ M1, R2.T @ M2
+    base_vector = jnp.stack(second_pose.centre) - jnp.stack(first_pose.centre)
+    t1, t2 = jnp.stack(first_mounting.centre), jnp.stack(second_mounting.centre)
+    shift = M_ref1 @ base_vector - (t2 - t1)
+    return jnp.concatenate([shift, turn_of(M_ref2 @ M_ref1.T)]) - measured
 
 
 # Invariant: residuals of a condition at the start scale with the network but define no scale.
@@ -147,27 +147,27 @@ class Rigs(ObservationTable):
         super().check(network)
         check_unique(self.image, self.source, "image")
         images = network.images
-        mountings, bases = self.given(network)
+        mountings, bases = self.read_settings(network)
         camera = {id: network.cameras[c].id for id, c in zip(images.id, images.camera)}
-        first_row: dict[tuple[str, ...], int] = {}
+        first_rows: dict[tuple[str, ...], int] = {}
         for row, key in enumerate(zip(self.rig, self.epoch, map(camera.__getitem__, self.image))):
-            if first_row.setdefault(key, row) != row:
+            if first_rows.setdefault(key, row) != row:
                 raise InputError(
                     f"{self.source(row)}: camera {key[2]!r} has two images at epoch {key[1]!r} of "
-                    f"rig {key[0]!r}; the other is in {self.source(first_row[key])}"
+                    f"rig {key[0]!r}; the other is in {self.source(first_rows[key])}"
                 )
 
-        cameras_of_rigs = {camera[id] for id in self.image}
-        named_cameras = [(f"mounting.{name}", name) for name in mountings]
-        named_cameras += [("bases", name) for base in bases for name in base.cameras]
-        for key, name in named_cameras:
-            if name not in cameras_of_rigs:
+        mounted_cameras = {camera[id] for id in self.image}
+        required_cameras = [(f"mounting.{name}", name) for name in mountings]
+        required_cameras += [("bases", name) for base in bases for name in base.cameras]
+        for key, name in required_cameras:
+            if name not in mounted_cameras:
                 raise InputError(
                     f"[{SECTION}]: {key}: no rig has a camera "
-                    f"{name!r}{did_you_mean(name, cameras_of_rigs)}"
+                    f"{name!r}{did_you_mean(name, mounted_cameras)}"
                 )
 
-    def given(self, network: Network) -> tuple[dict[str, GivenMounting], tuple[Base, ...]]:
+    def read_settings(self, network: Network) -> tuple[dict[str, GivenMounting], tuple[Base, ...]]:
         """The given mountings by camera, and the given bases."""
         radians = ANGLE_UNITS[network.angle_unit]
         mountings = read_mountings(SECTION, self.settings.get("mounting", {}), radians)
@@ -175,44 +175,44 @@ class Rigs(ObservationTable):
 
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images, radians = network.images, ANGLE_UNITS[network.angle_unit]
-        given_mountings, bases = self.given(network)
+        given_mountings, bases = self.read_settings(network)
         labels, places, turns, free, pairs = [], [], [], [], []
-        observed, bases_of_rows = [], []
+        observed, observed_bases = [], []
         for rig, (reference, mountings, all_epochs) in self.mounted(network).items():
             if len(mountings) < 2:
                 continue
-            first_row = len(labels)
+            begin = len(labels)
             # The reference first; its mounting is the identity and held, so that all others are
             # relative to it.
-            row_of = {c: first_row + k for k, c in enumerate(mountings)}
+            row_of_camera = {c: begin + k for k, c in enumerate(mountings)}
             for c, mounting in mountings.items():
                 name = network.cameras[c].id
-                given_mounting = given_mountings.get(name, NOTHING_GIVEN)
+                known_mounting = given_mountings.get(name, NOTHING_GIVEN)
                 if c == reference and name in given_mountings:
                     raise InputError(
                         f"[{SECTION}]: mounting.{name}: {name!r} is the reference camera of rig "
                         f"{rig!r}, which the others are mounted to; give theirs, or name another "
                         "reference"
                     )
-                t, R = _start(mounting, given_mounting)
+                t, R = _start_mounting(mounting, known_mounting)
                 labels.append(f"{name} of {rig}")
                 places.append(t)
                 turns.append(np.asarray(quaternion_from_matrix(R)))
-                free.append(c != reference and ~np.repeat(given_mounting.held, 3))
-                observed.append((row_of[c], given_mounting))
-            ids = {network.cameras[c].id: row_of[c] for c in mountings}
-            bases_of_rows += [
+                free.append(c != reference and ~np.repeat(known_mounting.is_held, 3))
+                observed.append((row_of_camera[c], known_mounting))
+            ids = {network.cameras[c].id: row_of_camera[c] for c in mountings}
+            observed_bases += [
                 (*(ids[name] for name in base.cameras), base)
                 for base in bases
                 if {*base.cameras} <= {*ids}
             ]
             for epoch in all_epochs.values():
                 if len(epoch) > 1:
-                    base_camera = reference if reference in epoch else min(epoch)
+                    anchor = reference if reference in epoch else min(epoch)
                     pairs += [
-                        (epoch[base_camera], i, row_of[base_camera], row_of[c])
+                        (epoch[anchor], i, row_of_camera[anchor], row_of_camera[c])
                         for c, i in epoch.items()
-                        if c != base_camera
+                        if c != anchor
                     ]
         if not pairs:
             raise InputError(f"{self.source.name}: no epoch has images of two cameras")
@@ -227,8 +227,8 @@ class Rigs(ObservationTable):
         )
         # Exact: a thousandth of what image points give, as a length and as an angle at the median
         # distance, so that the normal equations stay well conditioned.
-        sigma_across_rays = across_rays(network)
-        length = self.settings.get("sigma_position", EXACT_SIGMA * sigma_across_rays)
+        sigma_across = sigma_across_rays(network)
+        length = self.settings.get("sigma_position", EXACT_SIGMA * sigma_across)
         depth = np.median(
             np.linalg.norm(
                 network.points.position[network.observations.point]
@@ -238,25 +238,24 @@ class Rigs(ObservationTable):
         )
         # The setting is in the unit of angles, its default in radians.
         angle = (
-            self.settings.get("sigma_angle", EXACT_SIGMA * sigma_across_rays / depth / radians)
-            * radians
+            self.settings.get("sigma_angle", EXACT_SIGMA * sigma_across / depth / radians) * radians
         )
         sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
-        mounted = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
-        sets = [mounted, *observe_mountings(*zip(*observed))]
-        if bases_of_rows:
-            base_camera, other_rows, base = zip(*bases_of_rows)
-            length, sigma_of_lengths = (
+        observations = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
+        sets = [observations, *observe_mountings(*zip(*observed))]
+        if observed_bases:
+            first_rows, second_rows, base = zip(*observed_bases)
+            length, base_sigma = (
                 np.array([getattr(b, n) for b in base]) for n in ("length", "sigma")
             )
             sets.append(
-                BASES((np.array(base_camera), np.array(other_rows)), length, sigma=sigma_of_lengths)
+                BASES((np.array(first_rows), np.array(second_rows)), length, sigma=base_sigma)
             )
         return Contribution((mounting,), sets, ((MOUNTING, scale_position),))
 
     def scales(self, network: Network) -> list[float]:
         """The given bases, by those of the orientations of the images."""
-        given_mountings, bases = self.given(network)
+        given_mountings, bases = self.read_settings(network)
         ratios = []
         for rig in self.mounted(network).values():
             position_of = {
@@ -265,9 +264,9 @@ class Rigs(ObservationTable):
                 if mounting is not None
             }
             lengths = [
-                (given_mounting.length, np.linalg.norm(position_of[name]))
-                for name, given_mounting in given_mountings.items()
-                if name in position_of and given_mounting.length is not None
+                (known_mounting.length, np.linalg.norm(position_of[name]))
+                for name, known_mounting in given_mountings.items()
+                if name in position_of and known_mounting.length is not None
             ]
             lengths += [
                 (
@@ -278,9 +277,9 @@ class Rigs(ObservationTable):
                 if {*base.cameras} <= {*position_of}
             ]
             ratios += [
-                float(length / present_length)
-                for length, present_length in lengths
-                if present_length > 0
+                float(length / computed_length)
+                for length, computed_length in lengths
+                if computed_length > 0
             ]
         return ratios
 
@@ -293,23 +292,23 @@ class Rigs(ObservationTable):
         for rig, epoch, id in zip(self.rig, self.epoch, self.image):
             of_epoch = rigs.setdefault(rig, {}).setdefault(epoch, {})
             of_epoch[int(images.camera[row[id]])] = row[id]
-        mounted = {}
+        mounted_cameras = {}
         for rig, epochs in rigs.items():
-            epochs_of_several = [epoch for epoch in epochs.values() if len(epoch) > 1]
-            reference = self._reference(epochs_of_several or [*epochs.values()], network)
-            mountings = _mountings(epochs_of_several, reference, images.position, M)
-            mounted[rig] = MountedCameras(reference, mountings, epochs)
-        return mounted
+            shared_epochs = [epoch for epoch in epochs.values() if len(epoch) > 1]
+            reference = self._reference(shared_epochs or [*epochs.values()], network)
+            mountings = _mountings(shared_epochs, reference, images.position, M)
+            mounted_cameras[rig] = MountedCameras(reference, mountings, epochs)
+        return mounted_cameras
 
     def _reference(self, epochs: Sequence[Mapping[int, int]], network: Network) -> int:
         ids = [camera.id for camera in network.cameras]
         cameras = Counter(c for epoch in epochs for c in epoch)
-        named_reference = self.settings.get("reference")
-        if named_reference in ids and ids.index(named_reference) in cameras:
-            return ids.index(named_reference)
-        if named_reference is not None and named_reference not in ids:
+        reference_name = self.settings.get("reference")
+        if reference_name in ids and ids.index(reference_name) in cameras:
+            return ids.index(reference_name)
+        if reference_name is not None and reference_name not in ids:
             raise InputError(
-                f"[{SECTION}]: reference is {named_reference!r}, but there is no such camera"
+                f"[{SECTION}]: reference is {reference_name!r}, but there is no such camera"
             )
         return max(sorted(cameras), key=cameras.__getitem__, default=0)
 
@@ -317,14 +316,14 @@ class Rigs(ObservationTable):
 NOTHING_GIVEN = GivenMounting(None, None, np.full(6, np.inf), None, (False, False))
 
 
-def _start(mounting: MountedPose | None, given: GivenMounting) -> MountedPose:
+def _start_mounting(mounting: MountedPose | None, known_mounting: GivenMounting) -> MountedPose:
     """The start value of a mounting: that of the orientations of the images, except for what is
     held; of a camera that nothing connects with the reference what is given, or its place."""
     t, R = mounting or MountedPose(np.zeros(3), np.eye(3))
-    if given.position is not None and (mounting is None or given.held[0]):
-        t = given.position
-    if given.angles is not None and (mounting is None or given.held[1]):
-        R = np.asarray(matrix_from_omega_phi_kappa(given.angles))
+    if known_mounting.position is not None and (mounting is None or known_mounting.is_held[0]):
+        t = known_mounting.position
+    if known_mounting.angles is not None and (mounting is None or known_mounting.is_held[1]):
+        R = np.asarray(matrix_from_omega_phi_kappa(known_mounting.angles))
     return MountedPose(t, R)
 
 
@@ -336,41 +335,43 @@ def _mountings(
 ) -> dict[int, MountedPose | None]:
     """The mountings of the cameras; one that has no epoch with the reference by way of another."""
     cameras = sorted({c for epoch in epochs for c in epoch}, key=lambda c: c != reference)
-    mounting_of: dict[int, MountedPose | None] = dict.fromkeys(cameras)
-    mounting_of[reference] = MountedPose(np.zeros(3), np.eye(3))
+    mountings: dict[int, MountedPose | None] = dict.fromkeys(cameras)
+    mountings[reference] = MountedPose(np.zeros(3), np.eye(3))
     to_visit = [reference]
     for known_camera in to_visit:
-        base = mounting_of[known_camera]
+        base = mountings[known_camera]
         assert base is not None
         for c in cameras:
-            if mounting_of[c] is None and (step := _mounting_between(epochs, known_camera, c, position, M)):
+            if mountings[c] is None and (
+                step := _relative_pose(epochs, known_camera, c, position, M)
+            ):
                 # x_c = R·(M_known·(X − X_known) − t), and M_known = R_known·M_reference
                 place = base.position + base.rotation.T @ step.position
-                mounting_of[c] = MountedPose(place, step.rotation @ base.rotation)
+                mountings[c] = MountedPose(place, step.rotation @ base.rotation)
                 to_visit.append(c)
-    return mounting_of
+    return mountings
 
 
-def _mounting_between(
+def _relative_pose(
     epochs: Sequence[Mapping[int, int]],
-    camera_a: int,
-    camera_b: int,
+    base_camera: int,
+    camera: int,
     position: Float[np.ndarray, "images 3"],
     M: Float[np.ndarray, "images 3 3"],
 ) -> MountedPose | None:
     """A camera in the frame of another, at the epoch with the median position; None without an
     epoch of both."""
-    mountings = [
+    poses = [
         MountedPose(
-            M[e[camera_a]] @ (position[e[camera_b]] - position[e[camera_a]]),
-            M[e[camera_b]] @ M[e[camera_a]].T,
+            M[e[base_camera]] @ (position[e[camera]] - position[e[base_camera]]),
+            M[e[camera]] @ M[e[base_camera]].T,
         )
         for e in epochs
-        if camera_a in e and camera_b in e
+        if base_camera in e and camera in e
     ]
-    if not mountings:
+    if not poses:
         return None
     # Of a whole epoch, not a mean of all: position and rotation of one epoch belong together, and a
     # mean of rotations from poor start values is none of them.
-    t = np.array([t for t, _ in mountings])
-    return mountings[np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()]
+    t = np.array([t for t, _ in poses])
+    return poses[np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()]

@@ -53,7 +53,7 @@ from jaxbundle.network.kinds.fit_hand_eye import Rigid, other_side, solve, turns
 from jaxbundle.network.kinds.mountings import (
     AXES,
     GivenMounting,
-    given_mounting,
+    mounting_minus_given,
     read_mountings,
 )
 from jaxbundle.network.rules import check_unique
@@ -84,7 +84,7 @@ class HandPose:
     type: str
 
     def __call__(
-        self, image: Posed, eye: Posed, frame: Posed, observed: tuple[Array, Array]
+        self, image: Posed, eye: Posed, frame: Posed, measured: tuple[Array, Array]
     ) -> Float[Array, "6"]:
         if self.type == IN_HAND:
             position = frame.ray(image.place(eye.ray((0.0, 0.0, 0.0))))
@@ -92,7 +92,7 @@ class HandPose:
         else:
             position = eye.place(image.ray(frame.centre))
             R = eye.rotation.matrix().T @ image.rotation.matrix() @ frame.rotation.matrix().T
-        return jnp.concatenate([jnp.stack(position) - observed[0], small_turn(R @ observed[1].T)])
+        return jnp.concatenate([jnp.stack(position) - measured[0], small_turn(R @ measured[1].T)])
 
 
 def small_turn(D: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -105,14 +105,14 @@ def small_turn(D: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 @dataclasses.dataclass(frozen=True)
 class HandPart(HandPose):
-    """Three of the six: position, or rotation."""
+    """Three of the six, from `begin` (0: position, 3: rotation)."""
 
-    first: int
+    begin: int
 
     def __call__(
-        self, image: Posed, eye: Posed, frame: Posed, observed: tuple[Array, Array]
+        self, image: Posed, eye: Posed, frame: Posed, measured: tuple[Array, Array]
     ) -> Float[Array, "3"]:
-        return super().__call__(image, eye, frame, observed)[self.first : self.first + 3]
+        return super().__call__(image, eye, frame, measured)[self.begin : self.begin + 3]
 
 
 class HandEyeTables(NamedTuple):
@@ -182,8 +182,8 @@ class RobotPoses(ObservationTable):
     def rescale(self, factors: Mapping[str, float]) -> "RobotPoses":
         """With σ multiplied by the factors of positions and rotations, by the names of their
         kinds."""
-        factor_of_column = np.repeat([factors.get(name, 1.0) for name in PARTS], 3)
-        return dataclasses.replace(self, sigma=self.sigma * factor_of_column)
+        axis_factors = np.repeat([factors.get(name, 1.0) for name in PARTS], 3)
+        return dataclasses.replace(self, sigma=self.sigma * axis_factors)
 
     @property
     def type(self) -> str:
@@ -220,24 +220,26 @@ class RobotPoses(ObservationTable):
             B = Rigid(B.R, B.t + (B.R @ origin[:, None])[..., 0])
         cameras, of_camera = np.unique(network.images.camera[image], return_inverse=True)
         radians = ANGLE_UNITS[network.angle_unit]
-        given = None
+        known_mounting = None
         if "camera" in self.settings:
-            given = read_mountings(SECTION, {"camera": self.settings["camera"]}, radians)["camera"]
+            known_mounting = read_mountings(SECTION, {"camera": self.settings["camera"]}, radians)[
+                "camera"
+            ]
         for c in range(len(cameras)):
-            self._check_motions(A, of_camera == c, given, network.cameras[cameras[c]].id)
+            self._check_motions(A, of_camera == c, known_mounting, network.cameras[cameras[c]].id)
         eyes, frames, names = [], [], TABLES[self.type]
         for c in range(len(cameras)):
             rows = of_camera == c
             hand_poses, camera_poses = (Rigid(T.R[rows], T.t[rows]) for T in (A, B))
-            eye, frame = self._start(hand_poses, camera_poses, given)
+            eye, frame = self._start(hand_poses, camera_poses, known_mounting)
             eyes.append(eye)
             frames.append(frame)
         # Of several cameras the frame of the first: the others agree but for noise.
         labels = [network.cameras[c].id for c in cameras]
-        eye = _pose_table(names.eye, eyes, labels, given)
+        eye = _pose_table(names.eye, eyes, labels, known_mounting)
         frame = _pose_table(names.frame, frames[:1], ["robot"], None)
         rows = (image, of_camera, np.zeros(len(image), int))
-        sets = [*self._observe(names, rows), *_observe_camera(eye, given)]
+        sets = [*self._observe(names, rows), *_observe_camera(eye, known_mounting)]
         actions = ((names.eye, scale_position), (names.frame, move_pose))
         return Contribution((eye, frame), sets, actions)
 
@@ -250,17 +252,23 @@ class RobotPoses(ObservationTable):
         axes, units = (PLACE, ("rx", "ry", "rz")), ("length", "angle")
         parts = zip(PARTS, (0, 3), axes, units)
         return [
-            Kind(name, HandPart(self.type, first_column), tables, axes, units)(
-                rows, measured, sigma=self.sigma[:, first_column : first_column + 3]
+            Kind(name, HandPart(self.type, begin), tables, axes, units)(
+                rows, measured, sigma=self.sigma[:, begin : begin + 3]
             )
-            for name, first_column, axes, units in parts
+            for name, begin, axes, units in parts
         ]
 
-    def _start(self, A: Rigid, B: Rigid, given: GivenMounting | None) -> tuple[Rigid, Rigid]:
+    def _start(
+        self, A: Rigid, B: Rigid, known_mounting: GivenMounting | None
+    ) -> tuple[Rigid, Rigid]:
         """The pose of the camera, x_camera = M·(x − t) as (M, t), and that of the frame."""
-        if given is not None and given.position is not None and given.angles is not None:
-            R = np.asarray(matrix_from_omega_phi_kappa(given.angles)).T
-            eye = Rigid(R, given.position)  # camera → hand, or → base
+        if (
+            known_mounting is not None
+            and known_mounting.position is not None
+            and known_mounting.angles is not None
+        ):
+            R = np.asarray(matrix_from_omega_phi_kappa(known_mounting.angles)).T
+            eye = Rigid(R, known_mounting.position)  # camera → hand, or → base
             if self.type == IN_HAND:
                 frame = other_side(A, eye, B)
             else:  # A⁻¹·Y = X·B⁻¹
@@ -273,10 +281,14 @@ class RobotPoses(ObservationTable):
         return Rigid(eye.R.T, eye.t), Rigid(frame.R, centre)
 
     def _check_motions(
-        self, A: Rigid, rows: np.ndarray, given: GivenMounting | None, camera: str
+        self, A: Rigid, rows: np.ndarray, known_mounting: GivenMounting | None, camera: str
     ) -> None:
         """Refuse motions that leave the mounting of a camera undetermined."""
-        if given is not None and given.position is not None and given.angles is not None:
+        if (
+            known_mounting is not None
+            and known_mounting.position is not None
+            and known_mounting.angles is not None
+        ):
             return  # what is undetermined then is said by the adjustment
         where, number = f"{self.source.name}: camera {camera!r}", int(rows.sum())
         if number < FEWEST:
@@ -284,25 +296,24 @@ class RobotPoses(ObservationTable):
                 f"{where} has {number} poses of the robot; at least {FEWEST} are needed, with "
                 "rotations about two axes"
             )
-        turns_of_hand = turns(Rigid(A.R[rows], A.t[rows]))
+        turning = turns(Rigid(A.R[rows], A.t[rows]))
         noise = PARALLEL * np.sqrt(2) * self._angle_noise()
         remedy = (
             "turn the hand about a second axis, or give what is known: camera = { position = "
             f"[…], angles = […], sigma_position = …, sigma_angle = … }} in [{SECTION}]"
         )
-        undetermined_thing = "camera on the hand" if self.type == IN_HAND else "object in the hand"
-        if turns_of_hand.most <= noise:
+        mounted_object = "camera on the hand" if self.type == IN_HAND else "object in the hand"
+        if turning.about_axis <= noise:
             raise InputError(
                 f"{where}: the hand never turns between its poses, it only shifts: the position of "
-                f"the {undetermined_thing} is not determined (its rotation is); {remedy}"
+                f"the {mounted_object} is not determined (its rotation is); {remedy}"
             )
-        if turns_of_hand.across <= noise:
-            axis = ", ".join(f"{x:.2f}" for x in turns_of_hand.axis + 0.0)
+        if turning.across_axis <= noise:
+            axis = ", ".join(f"{x:.2f}" for x in turning.axis + 0.0)
             raise InputError(
                 f"{where}: all motions of the hand turn about parallel axes, ({axis}) of the hand "
-                f"(the others turn by {turns_of_hand.across:.2g} rad, within the noise): the "
-                "position of "
-                f"the {undetermined_thing} along that axis is not determined; {remedy}"
+                f"(the others turn by {turning.across_axis:.2g} rad, within the noise): the "
+                f"position of the {mounted_object} along that axis is not determined; {remedy}"
             )
 
     def _angle_noise(self) -> float:
@@ -314,66 +325,68 @@ class RobotPoses(ObservationTable):
 
 
 def _pose_table(
-    name: str, poses: Sequence[Rigid], labels: Sequence[str], given: GivenMounting | None
+    name: str, poses: Sequence[Rigid], labels: Sequence[str], known_mounting: GivenMounting | None
 ) -> Table:
     value = PoseValue(
         np.array([t for _, t in poses]),
         np.array([np.asarray(quaternion_from_matrix(M)) for M, _ in poses]),
     )
-    free = True if given is None else ~np.tile(np.repeat(given.held, 3), (len(poses), 1))
+    free = (
+        True
+        if known_mounting is None
+        else ~np.tile(np.repeat(known_mounting.is_held, 3), (len(poses), 1))
+    )
     return Table(name, value, Pose(), free, labels, AXES, name)
 
 
-def _observe_camera(eye: Table, given: GivenMounting | None) -> list[ObservationSet]:
+def _observe_camera(eye: Table, known_mounting: GivenMounting | None) -> list[ObservationSet]:
     """What is given of the mounting of the camera."""
-    if given is None or not np.isfinite(given.sigma).any():
+    if known_mounting is None or not np.isfinite(known_mounting.sigma).any():
         return []
-    kind = Kind("given camera", given_mounting, (eye.name,), AXES, POSE_UNITS, snooped="")
-    parts = (given.position, given.angles)
+    kind = Kind("given camera", mounting_minus_given, (eye.name,), AXES, POSE_UNITS, snooped="")
+    parts = (known_mounting.position, known_mounting.angles)
     measured = np.concatenate([np.zeros(3) if part is None else part for part in parts])
-    uncertainty: dict[str, Any] = {"sigma": np.tile(given.sigma, (eye.rows, 1))}
-    if given.covariance is not None:
-        uncertainty = {"covariance": np.tile(given.covariance, (eye.rows, 1, 1))}
+    uncertainty: dict[str, Any] = {"sigma": np.tile(known_mounting.sigma, (eye.rows, 1))}
+    if known_mounting.covariance is not None:
+        uncertainty = {"covariance": np.tile(known_mounting.covariance, (eye.rows, 1, 1))}
     return [kind((np.arange(eye.rows),), np.tile(measured, (eye.rows, 1)), **uncertainty)]
 
 
 def _attitude_names(table: Columns) -> tuple[str, ...]:
     forms = [names for names in ATTITUDES if {*names} & {*table.values}]
     if len(forms) != 1:
-        known_forms = "; ".join(", ".join(names) for names in ATTITUDES)
+        expected = "; ".join(", ".join(names) for names in ATTITUDES)
         raise InputError(
             f"{table.source.name}: the attitude of the hand is given "
-            f"{'twice' if forms else 'nowhere'}; expected the columns of one form: {known_forms}"
+            f"{'twice' if forms else 'nowhere'}; expected the columns of one form: {expected}"
         )
     return forms[0]
 
 
 def _rotations(
-    table: Columns,
-    names: Sequence[str],
-    angles_or_quaternions: Float[np.ndarray, "n k"],
-    radians: float,
+    table: Columns, names: Sequence[str], values: Float[np.ndarray, "n k"], radians: float
 ) -> Float[np.ndarray, "n 3 3"]:
     """Rotation matrices hand → base."""
     if names == QUATERNION:
-        length = np.linalg.norm(angles_or_quaternions, axis=1)
+        length = np.linalg.norm(values, axis=1)
         # A part in a hundred: printed with two digits.
         for row in np.flatnonzero(abs(length - 1) > 0.01)[:1]:
             raise InputError(
                 f"{table.source(row)}: the quaternion has the length {length[row]:.4g}; expected 1"
             )
-        return np.array(
-            [np.asarray(matrix_from_quaternion(q)) for q in angles_or_quaternions / length[:, None]]
-        )
-    angles_or_quaternions = angles_or_quaternions * radians
+        return np.array([np.asarray(matrix_from_quaternion(q)) for q in values / length[:, None]])
+    values = values * radians
     if names[0] == "rx":
-        return np.array([np.asarray(matrix_from_rotation_vector(v)) for v in angles_or_quaternions])
+        return np.array([np.asarray(matrix_from_rotation_vector(v)) for v in values])
     if names[0] == "roll":
-        about = lambda k, a: np.asarray(matrix_from_rotation_vector(a * np.eye(3)[k]))
+        rotation_about = lambda k, a: np.asarray(matrix_from_rotation_vector(a * np.eye(3)[k]))
         return np.array(
-            [about(2, y) @ about(1, p) @ about(0, r) for r, p, y in angles_or_quaternions]
+            [
+                rotation_about(2, y) @ rotation_about(1, p) @ rotation_about(0, r)
+                for r, p, y in values
+            ]
         )
-    return np.array([np.asarray(matrix_from_omega_phi_kappa(a)).T for a in angles_or_quaternions])
+    return np.array([np.asarray(matrix_from_omega_phi_kappa(a)).T for a in values])
 
 
 def _precision(
@@ -381,7 +394,7 @@ def _precision(
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6 6"]]:
     """σ and covariances of the poses, one of them NaN."""
     n = len(table)
-    nothing = np.full((n, 6, 6), np.nan)
+    no_covariance = np.full((n, 6, 6), np.nan)
     if {*COVARIANCE} & {*table.values}:
         if {*SIGMAS} & {*table.values}:
             raise InputError(f"{table.source.name}: give σ or covariances (c11 …), not both")
@@ -404,4 +417,4 @@ def _precision(
                 f"hand is missing; give {', '.join(SIGMAS[3 * k : 3 * k + 3])}, or {key} in "
                 f"[{SECTION}]: the repeatability of the robot"
             )
-    return sigma * unit, nothing
+    return sigma * unit, no_covariance

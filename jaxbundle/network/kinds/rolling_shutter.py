@@ -128,25 +128,25 @@ class RollingShutter(ObservationTable):
             network.images.camera[network.observations.image],
         )
         # Relative to the middle line, so that the pose of an image is that of its middle exposure.
-        moving = self.line_times(network)[camera_of_ray] != 0
+        is_moving = self.line_times(network)[camera_of_ray] != 0
         lines = np.zeros(len(rays))
-        for c in np.unique(camera_of_ray[moving]):
-            camera, is_of_camera = network.cameras[c], camera_of_ray == c
+        for c in np.unique(camera_of_ray[is_moving]):
+            camera, mask = network.cameras[c], camera_of_ray == c
             if camera.image_size is None:
                 raise InputError(
                     f"camera {camera.id!r}: image_size is needed for the exposure time of a line"
                 )
-            xy, sigma = rays.xy[is_of_camera], rays.sigma[is_of_camera]
-            uv, _ = to_image_unit(network.cameras, camera_of_ray[is_of_camera], xy, sigma, "px")
-            lines[is_of_camera] = uv[:, 1] - (camera.image_size[1] - 1) / 2
+            xy, sigma = rays.xy[mask], rays.sigma[mask]
+            uv, _ = to_image_unit(network.cameras, camera_of_ray[mask], xy, sigma, "px")
+            lines[mask] = uv[:, 1] - (camera.image_size[1] - 1) / 2
         return lines
 
     def declare(self, network: Network, origin: Float[np.ndarray, "3"]) -> Contribution:
         images, parameters = network.images, Parameters.from_settings(SECTION, self.settings, FREE)
         times = self.line_times(network)
         velocity, sigma = np.zeros((len(images), 6)), np.full((len(images), 6), np.nan)
-        image_rows = rows_of(self.image, images)
-        velocity[image_rows], sigma[image_rows] = self.velocity, self.sigma
+        rows = rows_of(self.image, images)
+        velocity[rows], sigma[rows] = self.velocity, self.sigma
         common = np.array([parameters.sigma.get(name, np.inf) for name in VELOCITY])
         sigma = np.where(np.isnan(sigma), common, sigma)
         # A camera with a global shutter is in the same tables with a read-out of 0: held, it has no
@@ -155,12 +155,12 @@ class RollingShutter(ObservationTable):
         moves = Table(
             VELOCITIES, velocity, Vector(6), free, images.id, VELOCITY, "velocity of image"
         )
-        is_known = parameters.mask(["line_time"]) & (times != 0)[:, None]
+        free_line_time = parameters.mask(["line_time"]) & (times != 0)[:, None]
         read_out = Table(
             READ_OUT,
             times[:, None],
             Vector(1),
-            is_known,
+            free_line_time,
             [camera.id for camera in network.cameras],
             ("line_time",),
             "read-out of camera",
@@ -183,8 +183,8 @@ class RollingShutter(ObservationTable):
         camera = network.images.camera[image]
         # Within a strip of one camera: between strips the platform turns.
         for strip in sorted({*zip(camera.tolist(), self.strip)} if neighbour_sigma else ()):
-            is_of_strip = np.array([pair == strip for pair in zip(camera.tolist(), self.strip)])
-            order = np.flatnonzero(is_of_strip)[np.argsort(self.time[is_of_strip], kind="stable")]
+            mask = np.array([pair == strip for pair in zip(camera.tolist(), self.strip)])
+            order = np.flatnonzero(mask)[np.argsort(self.time[mask], kind="stable")]
             if len(order) > 1:
                 preceding, following = (order[0], *order[:-1]), (*order[1:], order[-1])
                 rows.append(np.stack([order, preceding, following]))
@@ -208,16 +208,16 @@ def between_neighbours(
     return velocity - jnp.concatenate([shift, turn]) / time
 
 
-def _check_neighbours(setting: Any, table: Columns) -> None:
-    if not isinstance(setting, Mapping) or set(setting) - {"v", "w"}:
+def _check_neighbours(neighbours: Any, table: Columns) -> None:
+    if not isinstance(neighbours, Mapping) or set(neighbours) - {"v", "w"}:
         raise InputError(
-            f"[{SECTION}]: neighbours is {show(setting)}; expected the σ of velocities and turns, "
-            f"{{ v = 0.5, w = 0.02 }}"
+            f"[{SECTION}]: neighbours is {show(neighbours)}; expected the σ of velocities and "
+            f"turns, {{ v = 0.5, w = 0.02 }}"
         )
-    for name, value in setting.items():
+    for name, value in neighbours.items():
         positive(f"[{SECTION}]: neighbours, σ of {name}", value)
     for row in np.flatnonzero(np.isnan(table.numbers("t")))[:1]:
-        if setting:
+        if neighbours:
             raise InputError(
                 f"{table.source(row)}: t, the time of exposure, is missing, which "
                 f"[{SECTION}] neighbours needs"

@@ -37,32 +37,30 @@ from jaxbundle.network.kinds.base import (
     numbers,
     rows_of,
 )
-from jaxbundle.network.kinds.figures import EXACT_SIGMA, across_rays, sigma_or_exact
+from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_across_rays, sigma_or_exact
 from jaxbundle.network.surface_models import have_common_point, surface_near
 from jaxbundle.network.tables import Network
 
 SECTION = "surfaces"
 
 
-def on_plane(
-    X: Float[Array, "3"], observed_and_plane: tuple[Array, Array, Array]
-) -> Float[Array, ""]:
+def on_plane(X: Float[Array, "3"], measured: tuple[Array, Array, Array]) -> Float[Array, ""]:
     """The distance of a point from a plane, minus the observed one."""
-    observed, *plane = observed_and_plane
+    observed, *plane = measured
     return distance_to_plane(X, *plane) - observed
 
 
-def on_mesh(X: Float[Array, "3"], observed_and_corners: tuple[Array, Array]) -> Float[Array, ""]:
+def on_mesh(X: Float[Array, "3"], measured: tuple[Array, Array]) -> Float[Array, ""]:
     """The distance of a point from the plane of the nearest triangle, minus the observed one."""
-    observed, corners = observed_and_corners
+    observed, corners = measured
     return distance_to_nearest_triangle(X, corners) - observed
 
 
 def above_grid(
-    X: Float[Array, "3"], observed_and_grid: tuple[Array, Array, Array, Array]
+    X: Float[Array, "3"], measured: tuple[Array, Array, Array, Array]
 ) -> Float[Array, ""]:
     """The height of a point above a grid, minus the observed one."""
-    observed, *grid = observed_and_grid
+    observed, *grid = measured
     return height_above_grid(X, *grid) - observed
 
 
@@ -90,8 +88,8 @@ class SurfacePoints(ObservationTable):
         cls, table: Columns, settings: Mapping[str, Any], radians: float
     ) -> "SurfacePoints":
         table.check_names(("surface", "point"), ("sigma",))
-        for name, setting in settings.items():
-            _check_surface(f"{SECTION}.{name}", setting)
+        for name, definition in settings.items():
+            _check_surface(f"{SECTION}.{name}", definition)
         surface = table.ids("surface")
         for row, name in enumerate(surface):
             if name not in settings:
@@ -117,14 +115,14 @@ class SurfacePoints(ObservationTable):
         """Refuse planes with a common point in a network without a scale: it would shrink to that
         point, where all residuals are 0. Off the planes the derivatives do not show it."""
         surfaces = [self.settings[name] for name in dict.fromkeys(self.surface)]
-        has_other_scale = any(
-            surface.GIVES_SCALE for surface in network.further if surface.TABLE != self.TABLE
+        scale_from_tables = any(
+            table.GIVES_SCALE for table in network.further if table.TABLE != self.TABLE
         )
-        is_held = network.points.has_role("control", "fixed").sum() > 1
-        is_held |= bool(np.isfinite(network.images.sigma).any())
+        scale_from_control = network.points.has_role("control", "fixed").sum() > 1
+        scale_from_control |= bool(np.isfinite(network.images.sigma).any())
         if (
-            has_other_scale
-            or is_held
+            scale_from_tables
+            or scale_from_control
             or len(network.distances)
             or any("plane" not in surface for surface in surfaces)
         ):
@@ -141,11 +139,11 @@ class SurfacePoints(ObservationTable):
         self._check_scale(network)
         point = rows_of(self.point, network.points)
         X = network.points.position[point]
-        sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * across_rays(network))
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * sigma_across_rays(network))
         sets: list[ObservationSet] = []
         for name in dict.fromkeys(self.surface):
-            rows = np.flatnonzero([surface_name == name for surface_name in self.surface])
-            nearest_parts, is_outside = surface_near(self.settings[name], X[rows], origin)
+            rows = np.flatnonzero([surface == name for surface in self.surface])
+            surface_parts, is_outside = surface_near(self.settings[name], X[rows], origin)
             for row in rows[is_outside][:1]:
                 raise InputError(
                     f"{self.source(row)}: point {self.point[row]!r} is outside of the surface "
@@ -153,23 +151,23 @@ class SurfacePoints(ObservationTable):
                 )
             kind = KINDS[next(form for form in KINDS if form in self.settings[name])]
             # The distance is what is observed: 0, for points on the surface.
-            measured = (np.zeros(len(rows)), *nearest_parts)
+            measured = (np.zeros(len(rows)), *surface_parts)
             label = f"{kind.name}, {name}"
             sets.append(kind((point[rows],), measured, sigma=sigma[rows], name=label))
         return Contribution((), sets)
 
 
-def _check_surface(where: str, surface: Any) -> None:
+def _check_surface(where: str, definition: Any) -> None:
     """Refuse what is no surface."""
-    check_settings(where, surface, (*KINDS, "normal"))
-    forms = [form for form in KINDS if form in surface]
-    if len(forms) != 1 or ("normal" in surface) != (forms == ["plane"]):
+    check_settings(where, definition, (*KINDS, "normal"))
+    forms = [form for form in KINDS if form in definition]
+    if len(forms) != 1 or ("normal" in definition) != (forms == ["plane"]):
         raise InputError(
-            f"[{where}]: {show(dict(surface))}; expected plane and normal, or mesh, or dem"
+            f"[{where}]: {show(dict(definition))}; expected plane and normal, or mesh, or dem"
         )
     if forms == ["plane"]:
-        numbers(where, "plane", surface["plane"], 3)
-        if not numbers(where, "normal", surface["normal"], 3).any():
+        numbers(where, "plane", definition["plane"], 3)
+        if not numbers(where, "normal", definition["normal"], 3).any():
             raise InputError(f"[{where}]: normal is 0; expected a direction")
-    elif not isinstance(surface[forms[0]], str | tuple | list):
-        raise InputError(f"[{where}]: {forms[0]} is {show(surface[forms[0]])}; expected a file")
+    elif not isinstance(definition[forms[0]], str | tuple | list):
+        raise InputError(f"[{where}]: {forms[0]} is {show(definition[forms[0]])}; expected a file")

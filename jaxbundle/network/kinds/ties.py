@@ -32,11 +32,11 @@ from jaxbundle.types import AnyArray, Scalar
 class SameParameter:
     """The parameter of one camera minus that of the other; columns in their tables."""
 
-    one: int
-    other: int
+    first_column: int
+    second_column: int
 
-    def __call__(self, a: Change, b: Change, observed: Scalar) -> Scalar:
-        return b[self.other] - a[self.one] - observed
+    def __call__(self, a: Change, b: Change, measured: Scalar) -> Scalar:
+        return b[self.second_column] - a[self.first_column] - measured
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class Ties(ObservationTable):
     def __len__(self) -> int:
         return len(self.camera)
 
-    def _present(self, network: Network) -> Bool[np.ndarray, " n"]:
+    def _included_rows(self, network: Network) -> Bool[np.ndarray, " n"]:
         known_ids = {camera.id for camera in network.cameras}
         return np.array([{*ids} <= known_ids for ids in zip(self.camera, self.other)], bool)
 
@@ -113,34 +113,41 @@ class Ties(ObservationTable):
         sigma = np.where(self.sigma > 0, self.sigma, EXACT_SIGMA * self._from_rays(network, index))
         sets: dict[tuple, list] = {}
         for row, (a, b, name) in enumerate(zip(self.camera, self.other, self.parameter)):
-            (table_a, k), (table_b, m) = place[index[a]], place[index[b]]
-            residual = SameParameter(table_a.parameters.index(name), table_b.parameters.index(name))
-            sets.setdefault((table_a.name, table_b.name, name, residual), []).append(
+            (first_table, k), (second_table, m) = place[index[a]], place[index[b]]
+            residual = SameParameter(
+                first_table.parameters.index(name), second_table.parameters.index(name)
+            )
+            sets.setdefault((first_table.name, second_table.name, name, residual), []).append(
                 (k, m, sigma[row])
             )
-        kind = lambda table_a, table_b, name, residual: Kind(
-            "same parameters", residual, (table_a, table_b), (name,), snooped="", invariant=True
+        kind = lambda first_table, second_table, name, residual: Kind(
+            "same parameters",
+            residual,
+            (first_table, second_table),
+            (name,),
+            snooped="",
+            invariant=True,
         )
         return Contribution(
             (),
             tuple(
-                kind(table_a, table_b, name, residual)(
+                kind(first_table, second_table, name, residual)(
                     (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])),
                     np.zeros(len(rows)),
                     sigma=np.array([r[2] for r in rows]),
                 )
-                for (table_a, table_b, name, residual), rows in sets.items()
+                for (first_table, second_table, name, residual), rows in sets.items()
             ),
         )
 
     def _from_rays(self, network: Network, index: Mapping[str, int]) -> Float[np.ndarray, " n"]:
         """σ of the parameters from the rays of their cameras, all else given; the smaller of the
         two."""
-        used_cameras = {index[id] for id in (*self.camera, *self.other)}
-        sigma_of = {c: parameter_sigmas(network, c) for c in used_cameras}
+        camera_rows = {index[id] for id in (*self.camera, *self.other)}
+        sigmas = {c: parameter_sigmas(network, c) for c in camera_rows}
         return np.array(
             [
-                min(sigma_of[index[id]][name] for id in (a, b))
+                min(sigmas[index[id]][name] for id in (a, b))
                 for a, b, name in zip(self.camera, self.other, self.parameter)
             ]
         )
@@ -150,15 +157,15 @@ def parameter_sigmas(network: Network, c: int) -> dict[str, float]:
     """By parameter of a camera, its σ from all its image points, all else given."""
     camera, rays = network.cameras[c], network.observations
     model = get_model(camera.model)
-    rays_of_camera = np.flatnonzero(network.images.camera[rays.image] == c)
+    rows = np.flatnonzero(network.images.camera[rays.image] == c)
     # A mean over the image, for a σ that only has to have the right size: 256 rays, evenly chosen,
     # give it to 1/√256 of its scatter.
     rays_of_sample = 256
-    sample = rays_of_camera[np.linspace(0, len(rays_of_camera) - 1, rays_of_sample).astype(int)]
+    sample = rows[np.linspace(0, len(rows) - 1, rays_of_sample).astype(int)]
     # σ of one parameter with all else given: 1/√(Σ(∂x/∂p)²/σ²), the scale of an exact condition.
     slope = np.asarray(_slopes(model, np.array(start_of(camera)), rays.xy[sample]))
     weight = np.nan_to_num(slope / rays.sigma[sample, :, None])
-    information = (weight**2).sum((0, 1)) * len(rays_of_camera) / rays_of_sample
+    information = (weight**2).sum((0, 1)) * len(rows) / rays_of_sample
     sigma = 1 / np.sqrt(np.maximum(information, np.finfo(float).tiny))
     return dict(zip(model.parameters, sigma.tolist()))
 

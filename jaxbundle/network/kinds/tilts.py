@@ -46,11 +46,11 @@ def elevations(
     pose: Posed, zero: Float[Array, "3"], readings: Float[Array, "3"]
 ) -> Float[Array, "3"]:
     """Elevations of the axes of a camera minus the readings."""
-    axes_in_space = [pose.rotation.apply_inverse(axis) for axis in CAMERA_AXES.values()]
+    axes = [pose.rotation.apply_inverse(axis) for axis in CAMERA_AXES.values()]
     # The root has no derivative at 0: an axis that is exactly vertical, which is not read.
-    horizontal = [jnp.sqrt(jnp.maximum(x * x + y * y, 1e-30)) for x, y, _ in axes_in_space]
-    computed = [jnp.arctan2(z, h) for (_, _, z), h in zip(axes_in_space, horizontal)]
-    return jnp.stack(computed) + zero - readings
+    level = [jnp.sqrt(jnp.maximum(x * x + y * y, 1e-30)) for x, y, _ in axes]
+    elevation = [jnp.arctan2(z, h) for (_, _, z), h in zip(axes, level)]
+    return jnp.stack(elevation) + zero - readings
 
 
 TILT = Kind("tilts", elevations, ("image", "clinometer"), AXES, "angle")
@@ -76,8 +76,8 @@ class Tilts(ObservationTable):
         readings = np.stack([table.numbers(axis) for axis in AXES], 1) * radians
         sigma = np.stack([positive_sigma(table, f"s{a}", required=False) for a in AXES], 1)
         for row, k in np.argwhere(np.isnan(readings) != np.isnan(sigma))[:1]:
-            both_columns = f"{AXES[k]} and s{AXES[k]}"
-            raise InputError(f"{table.source(row)}: expected {both_columns}, got one of them")
+            expected = f"{AXES[k]} and s{AXES[k]}"
+            raise InputError(f"{table.source(row)}: expected {expected}, got one of them")
         for row in np.flatnonzero(np.isnan(readings).all(1))[:1]:
             raise InputError(f"{table.source(row)}: nothing was read: expected {', '.join(AXES)}")
         for row, k in np.argwhere(np.abs(readings) > STEEPEST)[:1]:
@@ -95,9 +95,9 @@ class Tilts(ObservationTable):
         )
 
     def columns(self, radians: float) -> dict:
-        is_missing = np.isinf(self.sigma)
+        is_unread = np.isinf(self.sigma)
         readings, sigma = (
-            np.where(is_missing, np.nan, x / radians).T for x in (self.elevation, self.sigma)
+            np.where(is_unread, np.nan, x / radians).T for x in (self.elevation, self.sigma)
         )
         columns = dict(zip(AXES, readings)) | {f"s{a}": s for a, s in zip(AXES, sigma)}
         return {"image": self.image} | columns

@@ -66,22 +66,18 @@ def compare_with_rpc(
         point = lambda pose, slopes, h, applied=corrections: ground_point(
             pose, slopes, Height(level=h, earth=WGS84), applied
         )
-        points, points_next_line, points_next_pixel = np.split(
-            np.stack(jax.vmap(point)(*sights)), 3, axis=1
-        )
+        points, next_lines, next_pixels = np.split(np.stack(jax.vmap(point)(*sights)), 3, axis=1)
         projected = jax.vmap(lambda *X: project(rpc, *geodetic(WGS84, X)))(*points)
-        difference = np.stack([np.asarray(projected[0]) - line, np.asarray(projected[1]) - pixel])
+        misclosures = np.stack([np.asarray(projected[0]) - line, np.asarray(projected[1]) - pixel])
         ground = np.linalg.norm(
-            difference[0] * (points_next_line - points)
-            + difference[1] * (points_next_pixel - points),
-            axis=0,
+            misclosures[0] * (next_lines - points) + misclosures[1] * (next_pixels - points), axis=0
         )
-        difference = np.hypot(*difference)
-        is_known = np.isfinite(ground)
-        rms = lambda values, is_known=is_known: float(np.sqrt(np.mean(values[is_known] ** 2)))
+        misclosures = np.hypot(*misclosures)
+        is_finite = np.isfinite(ground)
+        rms = lambda values, is_finite=is_finite: float(np.sqrt(np.mean(values[is_finite] ** 2)))
         agreements.append(
-            Agreement(rms(ground), float(ground[is_known].max()), rms(difference))
-            if is_known.any()
+            Agreement(rms(ground), float(ground[is_finite].max()), rms(misclosures))
+            if is_finite.any()
             else Agreement(np.nan, np.nan, np.nan)
         )
     return agreements

@@ -191,9 +191,9 @@ def fit_image(
     lines, pixels, layers = size
     levels = np.linspace(low, high, layers)
     fit = fit_rpc(image_table(image, earth, levels, (lines, pixels)), ridge=ridge)
-    heights_between = (levels[1:] + levels[:-1]) / 2
-    denser = image_table(image, earth, heights_between, (2 * lines, 2 * pixels))
-    return fit, check_rpc(fit.rpc, denser)
+    middle_levels = (levels[1:] + levels[:-1]) / 2
+    check_table = image_table(image, earth, middle_levels, (2 * lines, 2 * pixels))
+    return fit, check_rpc(fit.rpc, check_table)
 
 
 def image_table(
@@ -314,13 +314,13 @@ def _fit_axis(
     # Strongly damped: the linear equations weigh points by their denominators and may be far off.
     start_tau = max(s[0] * settings.start_ridge, ridge or 0.0)
     start = _solve_with_ridge(U, s, Vt, D, y, start_tau)
-    c, tau, settled = iterated = _iterate(start, T, y, D, scale, ridge, settings)
+    c, tau, settled = first_result = _iterate(start, T, y, D, scale, ridge, settings)
     while ridge is None and not settled and tau < s[0] * CANDIDATE_RIDGES[0]:
         # Chosen by its linear prediction, it may be too small for the iteration to come to an end.
         tau *= CANDIDATE_RIDGES[0] / CANDIDATE_RIDGES[1]
         c, _, settled = _iterate(start, T, y, D, scale, tau, settings)
     if not settled:
-        c, tau, settled = iterated
+        c, tau, settled = first_result
     v, J = map(np.asarray, _value_and_jacobian(c, T, y))
     U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
     # n − Σh, the effective number of unknowns of a ridge regression
@@ -328,8 +328,15 @@ def _fit_axis(
     if sigma is None:
         sigma = scale * float(np.sqrt(np.sum(v**2) / redundancy))
     # (N + τ²D²)⁻¹·Jᵀ = D⁻¹·V·diag(s/(s² + τ²))·Uᵀ, and UᵀU = I
-    inverse_root = Vt.T * (s / (s**2 + tau**2)) / D[:, None]
-    return c, (sigma / scale) ** 2 * inverse_root @ inverse_root.T, sigma, redundancy, tau, settled
+    root_cofactor = Vt.T * (s / (s**2 + tau**2)) / D[:, None]
+    return (
+        c,
+        (sigma / scale) ** 2 * root_cofactor @ root_cofactor.T,
+        sigma,
+        redundancy,
+        tau,
+        settled,
+    )
 
 
 def _iterate(
@@ -374,14 +381,14 @@ def _shorten(
         v = T @ c[:TERMS] / np.where(denominator > 0, denominator, 1.0) - y
         return np.sum(v**2) + np.sum((ridge * c) ** 2) if (denominator > 0).all() else np.inf
 
-    cost_now = square(c)
+    start_square = square(c)
     for _ in range(halvings):
         # At the minimum the sum changes by rounding only: relative, and absolute of an exact fit.
-        cost_after = square(c + step)
-        if cost_after < np.inf and cost_after <= cost_now * (1 + 1e-12) + 1e-28:
+        new_square = square(c + step)
+        if new_square < np.inf and new_square <= start_square * (1 + 1e-12) + 1e-28:
             return step
         step = step / 2
-    if cost_now == np.inf:
+    if start_square == np.inf:
         raise InputError(
             "the denominator vanishes within the table: no rational polynomials fit it; "
             "look for wrong rows, or give a larger ridge"

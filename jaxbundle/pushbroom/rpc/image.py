@@ -59,10 +59,10 @@ def locate_rpc_lines(
     pixels: Float[AnyArray, " pixels"],
 ) -> Float[Array, "3 lines pixels"]:
     """The points of all pixels of all lines, Earth-fixed; NaN where a ray misses the surface."""
-    locate_pixel = _point_at(image.rpc, surface)
+    locate_point = _point_at(image.rpc, surface)
     # Row by row, like `locate_lines`.
-    points_of_line = lambda line: jax.vmap(lambda pixel: locate_pixel(line, pixel)[0])(pixels)
-    return jnp.moveaxis(jax.lax.map(points_of_line, lines), -1, 0)
+    of_line = lambda line: jax.vmap(lambda pixel: locate_point(line, pixel)[0])(pixels)
+    return jnp.moveaxis(jax.lax.map(of_line, lines), -1, 0)
 
 
 def locate_rpc_points(
@@ -81,11 +81,11 @@ def _point_at(rpc: Rpc, surface: GroundSurface) -> Callable[[Scalar, Scalar], tu
     """The point of an image position, and its `RpcStatus`."""
     inverse, earth = fit_inverse(rpc), surface.earth or WGS84
 
-    def point_of_pixel(line: Scalar, pixel: Scalar) -> tuple[Array, Array]:
+    def locate_point(line: Scalar, pixel: Scalar) -> tuple[Array, Array]:
         longitude, latitude, height, status = locate_on(rpc, surface, line, pixel, inverse)
         return jnp.stack(earth_fixed(earth, (longitude, latitude, height))), status
 
-    return point_of_pixel
+    return locate_point
 
 
 def project_to_rpc(
@@ -95,8 +95,8 @@ def project_to_rpc(
     longitude, latitude, height = geodetic(surface.earth or WGS84, tuple(ground))
     L, P, _ = normalise(rpc, longitude, latitude, height)
     line, pixel = project(rpc, longitude, latitude, height)
-    is_within = (jnp.abs(L) <= REACH) & (jnp.abs(P) <= REACH)
-    return jnp.where(is_within, line, jnp.nan), jnp.where(is_within, pixel, jnp.nan)
+    is_in_reach = (jnp.abs(L) <= REACH) & (jnp.abs(P) <= REACH)
+    return jnp.where(is_in_reach, line, jnp.nan), jnp.where(is_in_reach, pixel, jnp.nan)
 
 
 def are_occluded_in_rpc(
@@ -109,11 +109,11 @@ def are_occluded_in_rpc(
 ) -> Bool[Array, "rows columns"]:
     """Whether the rays of image positions end before their points, by more than half a pixel of the
     map, metres (see `rectification`)."""
-    inverse, point_of_pixel = fit_inverse(rpc), _point_at(rpc, surface)
+    inverse, locate_point = fit_inverse(rpc), _point_at(rpc, surface)
 
     def is_occluded(line: Scalar, pixel: Scalar, X: Float[Array, "3"]) -> Array:
         _, downwards = sight(rpc, line, pixel, surface.earth or WGS84, inverse)
-        gap = difference(X, point_of_pixel(line, pixel)[0])
+        gap = difference(X, locate_point(line, pixel)[0])
         return jnp.asarray((dot(gap, downwards) > 0) & (length(gap) > half_pixel))
 
     of_row = lambda row: jax.vmap(is_occluded)(*row)

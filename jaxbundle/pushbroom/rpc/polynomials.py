@@ -155,57 +155,57 @@ def locate(
     `inverse` says.
     """
     H = (height - rpc.height_offset) / rpc.height_scale
-    line_and_sample = (
+    target = (
         (line - rpc.line_offset) / rpc.line_scale,
         (sample - rpc.sample_offset) / rpc.sample_scale,
     )
-    data = rpc, H, line_and_sample
+    data = rpc, H, target
     fixed = stop_gradient(data)
     misclosure = lambda L, P: _misclosure((L, P), None, fixed)
 
-    def goes_on(state: tuple[int, Place, Scalar]) -> Array:
+    def is_unsettled(state: tuple[int, Place, Scalar]) -> Array:
         number, _, last_step = state
         return jnp.asarray((number < max_steps) & (last_step > SETTLED))
 
     def newton(state: tuple[int, Place, Scalar]) -> tuple[int, Place, Scalar]:
         number, place, _ = state
-        ones, nil = jnp.ones_like(place[0]), jnp.zeros_like(place[0])
-        v, by_L = jax.jvp(misclosure, place, (ones, nil))
-        _, by_P = jax.jvp(misclosure, place, (nil, ones))
+        one, nil = jnp.ones_like(place[0]), jnp.zeros_like(place[0])
+        v, by_L = jax.jvp(misclosure, place, (one, nil))
+        _, by_P = jax.jvp(misclosure, place, (nil, one))
         # Both with the Jacobian of the first.
         step = _solve(by_L, by_P, v)
-        next_place = place[0] - step[0], place[1] - step[1]
-        correction = _solve(by_L, by_P, misclosure(*next_place))
-        next_place = next_place[0] - correction[0], next_place[1] - correction[1]
-        return number + 1, next_place, jnp.maximum(jnp.abs(step[0]), jnp.abs(step[1]))
+        new_place = place[0] - step[0], place[1] - step[1]
+        second_step = _solve(by_L, by_P, misclosure(*new_place))
+        new_place = new_place[0] - second_step[0], new_place[1] - second_step[1]
+        return number + 1, new_place, jnp.maximum(jnp.abs(step[0]), jnp.abs(step[1]))
 
-    begin = jnp.zeros_like(H), jnp.zeros_like(H)
+    start = jnp.zeros_like(H), jnp.zeros_like(H)
     if inverse is not None:
-        begin = stop_gradient(inverse).start(*fixed[2], fixed[1])
-    state = newton((0, begin, jnp.full_like(H, jnp.inf)))
+        start = stop_gradient(inverse).start(*fixed[2], fixed[1])
+    state = newton((0, start, jnp.full_like(H, jnp.inf)))
     if max_steps > 1:
-        state = jax.lax.while_loop(goes_on, newton, state)
-    _, place, last = state
+        state = jax.lax.while_loop(is_unsettled, newton, state)
+    _, place, last_step = state
     L, P = implicit_root(_misclosure, _solve_root, place, None, data)
-    settled = last <= SETTLED
+    settled = last_step <= SETTLED
     longitude = jnp.radians(rpc.longitude_offset + rpc.longitude_scale * L)
     latitude = jnp.radians(rpc.latitude_offset + rpc.latitude_scale * P)
     settled_only = lambda a: jnp.where(settled, a, jnp.nan)
-    status = jnp.where(settled, _inside(L, P, H, *line_and_sample), int(RpcStatus.NOT_CONVERGED))
+    status = jnp.where(settled, _domain_status(L, P, H, *target), int(RpcStatus.NOT_CONVERGED))
     return settled_only(longitude), settled_only(latitude), status
 
 
 def _misclosure(place: Place, _: None, data: tuple[Rpc, Scalar, Place]) -> Place:
     """Line and sample of (L, P), both in units of the scales, minus those wanted."""
-    rpc, H, line_and_sample = data
+    rpc, H, target = data
     line, sample = _ratios(rpc, *place, H)
-    return line - line_and_sample[0], sample - line_and_sample[1]
+    return line - target[0], sample - target[1]
 
 
 def _solve_root(times: Callable, _: None, b: Place) -> Place:
     """The solution of A·x = b, of `implicit_root`."""
-    ones, nil = jnp.ones_like(b[0]), jnp.zeros_like(b[0])
-    return _solve(times((ones, nil)), times((nil, ones)), b)
+    one, nil = jnp.ones_like(b[0]), jnp.zeros_like(b[0])
+    return _solve(times((one, nil)), times((nil, one)), b)
 
 
 def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Array:
@@ -213,8 +213,8 @@ def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Arr
     coefficients."""
     place = normalise(rpc, longitude, latitude, height)
     line, sample = _ratios(rpc, *place)
-    is_inside = _inside(*place, line, sample)
-    return jnp.where(jnp.isfinite(line + sample), is_inside, int(RpcStatus.NOT_CONVERGED))
+    status = _domain_status(*place, line, sample)
+    return jnp.where(jnp.isfinite(line + sample), status, int(RpcStatus.NOT_CONVERGED))
 
 
 def locate_on(
@@ -242,17 +242,20 @@ def locate_on(
         X = point_on_ray(o, d, surface.distance(o, d))
         h = surface.height(X)
         longitude, latitude, status = locate(rpc, line, sample, h, inverse)
-        placed = earth_fixed(earth, (longitude, latitude, h))
-        return (point_on_ray(o, difference(placed, X), 1.0), (longitude, latitude, h, status)), None
+        located = earth_fixed(earth, (longitude, latitude, h))
+        return (
+            point_on_ray(o, difference(located, X), 1.0),
+            (longitude, latitude, h, status),
+        ), None
 
-    nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
+    no_position = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
     # Also of a surface that rises above the heights of the domain the first point is met.
-    start = (point_on_ray(top, d, -ABOVE_DOMAIN), nothing)
+    start = (point_on_ray(top, d, -ABOVE_DOMAIN), no_position)
     # The ray is nearly parallel to the line of sight: a round leaves of the distance between both
     # only its product with the angle between them.
     (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=3)
-    missed = jnp.isnan(h)
-    return longitude, latitude, h, jnp.where(missed, int(RpcStatus.NOT_CONVERGED), status)
+    is_missed = jnp.isnan(h)
+    return longitude, latitude, h, jnp.where(is_missed, int(RpcStatus.NOT_CONVERGED), status)
 
 
 def sight(
@@ -306,9 +309,9 @@ def locate_points(
 
     # One step of nearly every image settles all: without the loop, which keeps its values in
     # memory between steps, in half the time.
-    first_results = locate_all(1)
-    settled = jnp.all(first_results[2] != int(RpcStatus.NOT_CONVERGED))
-    return jax.lax.cond(settled, lambda: first_results, lambda: locate_all(MAX_STEPS))
+    one_step = locate_all(1)
+    settled = jnp.all(one_step[2] != int(RpcStatus.NOT_CONVERGED))
+    return jax.lax.cond(settled, lambda: one_step, lambda: locate_all(MAX_STEPS))
 
 
 @without_masks
@@ -368,7 +371,7 @@ def _ratios(rpc: Rpc, L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, Scalar]:
     )
 
 
-def _inside(*values: Scalar) -> Int[Array, ""]:
+def _domain_status(*values: Scalar) -> Int[Array, ""]:
     """Status of normalised coordinates, ground and image."""
     largest = reduce(jnp.maximum, map(jnp.abs, values))
     return jnp.where(largest <= 1 + DOMAIN_MARGIN, int(RpcStatus.INSIDE), int(RpcStatus.OUTSIDE))
