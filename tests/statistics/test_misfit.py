@@ -1,5 +1,7 @@
 """Doubts about a priori σ and σ0, in words with the remedy."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -34,7 +36,10 @@ def test_nothing_is_said_of_what_fits():
     assert doubt_of_baarda(1.0, 3, 1000, 2000, 0.001) is doubt_of_fit(float("nan"), 1.0, 0) is None
 
 
-def test_the_longest_of_many_residuals():
-    """The level of the longest of n is reached by 1 − (1 − exp(−t²/2))ⁿ."""
-    t = critical_length(0.01, 500)
-    assert -np.expm1(500 * np.log1p(-np.exp(-t * t / 2))) == pytest.approx(0.01, rel=1e-9)
+@pytest.mark.parametrize("residuals", [1, 2, 3])
+def test_the_longest_of_many_residuals(residuals):
+    """The level of the longest of n is reached by 1 − (1 − P(χ²ₖ > t²))ⁿ; P in closed form."""
+    t = critical_length(0.01, 500, residuals)
+    plane, line = np.exp(-t * t / 2), math.erfc(t / math.sqrt(2))
+    beyond = {1: line, 2: plane, 3: line + math.sqrt(2 / math.pi) * t * plane}[residuals]
+    assert -np.expm1(500 * np.log1p(-beyond)) == pytest.approx(0.01, rel=1e-9)

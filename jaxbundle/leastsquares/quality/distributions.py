@@ -80,9 +80,11 @@ def critical_w(
     return sigma0 * tau_quantile(1 - level_of_one(significance, observations) / 2, redundancy)
 
 
-def critical_length(significance: float, residuals: int) -> float:
-    """Critical length of the longest of n residuals in the plane, in σ: t² ~ χ²₂."""
-    return math.sqrt(-2 * math.log(level_of_one(significance, residuals)))
+def critical_length(significance: float, observations: int, residuals_each: int = 2) -> float:
+    """Critical length of the longest of n vectors of k residuals each, in σ: t² ~ χ²ₖ; k = 2 in an
+    image."""
+    level = level_of_one(significance, observations)
+    return math.sqrt(chi2_quantile(1 - level, residuals_each))
 
 
 def level_of_one(significance: float, tests: int) -> float:

@@ -98,12 +98,17 @@ class Reweighted:
     def suspects(self, significance: float = 0.001) -> list[SuspectRow]:
         """Observations with residuals above the critical length, the worst first; `significance` is
         the probability of any in data without blunders."""
-        has_weight = {o: (self.solution.problem.weights(o) > 0).any(1) for o in self.lengths}
-        critical = critical_length(significance, sum(int(u.sum()) for u in has_weight.values()))
+        problem = self.solution.problem
+        residuals_each = {name: (problem.weights(name) > 0).sum(1) for name in self.lengths}
+        observations = sum(int(np.count_nonzero(k)) for k in residuals_each.values())
+        most = max((k.max(initial=0) for k in residuals_each.values()), default=0)
+        critical = np.array(
+            [np.inf, *(critical_length(significance, observations, k + 1) for k in range(most))]
+        )
         suspects = [
-            SuspectRow(o, row, float(t[row]), float(self.weights[o][row]))
-            for o, t in self.lengths.items()
-            for row in np.flatnonzero(has_weight[o] & (t > critical)).tolist()
+            SuspectRow(name, row, float(t[row]), float(self.weights[name][row]))
+            for name, t in self.lengths.items()
+            for row in np.flatnonzero(t > critical[residuals_each[name]]).tolist()
         ]
         return sorted(suspects, key=lambda s: -s.test)
 
