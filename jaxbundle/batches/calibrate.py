@@ -121,7 +121,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
         is_far = far_outside(batch.xy, batch.visible, batch.image_size, y_down)
         batch = dataclasses.replace(batch, visible=batch.visible & ~is_far)
     on_cpu = not on_accelerator()
-    key = ProgramKey(camera_model, batch.free, batch.known, on_cpu)
+    key = ProgramKey(camera_model, batch.free, batch.has_focal_length, on_cpu)
 
     def run(portion: Portion) -> Rows:
         solve = partial(solve_portion, key, max_iterations, batch.size)
@@ -130,7 +130,7 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
             rows if snooping is None else _snoop(key, solve, portion, rows, snooping, significance)
         )
 
-    portions, parts, done = [], [], 0
+    portions, parts, number_done = [], [], 0
     # Threads, not processes: compiled code leaves Python alone, and the programs are shared.
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
         # The first are solved while the next are padded.
@@ -140,10 +140,10 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
         ]
         for portion, future in zip(portions, solving):
             parts.append(future.result())
-            done += len(portion.cameras)
+            number_done += len(portion.cameras)
             if progress is not None:
-                progress("calibrating", done, len(batch))
-    solved = SolvedPortions(key, portions, parts, *batch.xy.shape[:2])
+                progress("calibrating", number_done, len(batch))
+    solved_portions = SolvedPortions(key, portions, parts, *batch.xy.shape[:2])
     shape = batch.xy.shape[1:3]
     parts = [_without_padding(portion, shape, rows) for portion, rows in zip(portions, parts)]
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
@@ -151,16 +151,16 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     if snooping is not None:
         rows["removed"] |= is_far
     if correlated is not None:
-        rows |= _under_errors(batch, rows, solved, correlated == "batch")
+        rows |= _under_errors(batch, rows, solved_portions, correlated == "batch")
     return _result(camera_model, batch, rows)
 
 
-def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> Rows:
+def _without_padding(portion: Portion, shape: tuple[int, int], padded: Rows) -> Rows:
     """The rows of the cameras of a portion, views at their original positions."""
     views, points = shape
     rows = {
         name: values[: len(portion.cameras)]
-        for name, values in solved.items()
+        for name, values in padded.items()
         if name not in OF_A_START
     }
     camera = np.arange(len(portion.cameras))[:, None]
@@ -174,52 +174,54 @@ def _without_padding(portion: Portion, shape: tuple[int, int], solved: Rows) -> 
 
 def _result(model: CameraModel, batch: Batch, rows: Rows) -> BatchCalibration:
     """Rows in the order of the cameras; NaN for no result."""
-    ended = np.where(batch.finite, rows["status"], NOT_FINITE)
-    solved = ended == CONVERGED
-    undetermined = _undetermined(model, batch, ended, rows)
+    status = np.where(batch.finite, rows["status"], NOT_FINITE)
+    is_solved = status == CONVERGED
+    undetermined = _undetermined(model, batch, status, rows)
     # Singular or at the limit: mostly the geometry of the views, which is then said in words
     # instead of a status that only tells the symptom.
     weak = np.full(len(batch), "", dtype=object)
-    for i in np.flatnonzero(np.isin(ended, (LIMIT, SINGULAR))):
+    for i in np.flatnonzero(np.isin(status, (LIMIT, SINGULAR))):
         points = batch.point if batch.point.ndim == 2 else batch.point[i]
         weak[i] = weak_geometry(points, batch.xy[i].astype(float), batch.visible[i])
     # The last RMS of those at the limit: the residuals may fit perfectly where nothing is
     # determined.
-    rms = np.where(ended == LIMIT, rows["rms"], np.nan)
+    rms = np.where(status == LIMIT, rows["rms"], np.nan)
     for name in {*OF_A_VIEW} & {*rows}:
         rows[name][~rows["views"]] = np.nan
     for values in rows.values():
         if np.issubdtype(values.dtype, np.floating):
-            values[~solved] = np.nan
-    rows["rms"] = np.where((weak != "") & ~solved, rms, rows["rms"])
-    ended = np.where(weak != "", WEAK, ended)
-    ended = np.where(solved & undetermined.any(1), WEAK, ended)
+            values[~is_solved] = np.nan
+    rows["rms"] = np.where((weak != "") & ~is_solved, rms, rows["rms"])
+    status = np.where(weak != "", WEAK, status)
+    status = np.where(is_solved & undetermined.any(1), WEAK, status)
     # Last, since it compares the cameras that have values.
-    ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
+    status = np.where(misfits(rows["rms"], rows["mean_length"], is_solved), MISFIT, status)
     del rows["reduced"], rows["mean_length"]
-    rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
-    rows["remark"] = remarks(model, batch, rows, solved & (ended == CONVERGED))
+    rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[status]
+    rows["remark"] = remarks(model, batch, rows, is_solved & (status == CONVERGED))
     rows["remark"] = np.where(weak != "", weak, rows["remark"])
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=key_of(model), parameters=free, **rows)
 
 
-def _under_errors(batch: Batch, rows: Rows, solved: SolvedPortions, common_sizes: bool) -> Rows:
+def _under_errors(
+    batch: Batch, rows: Rows, solved_portions: SolvedPortions, common_sizes: bool
+) -> Rows:
     """σ under errors that image points share; `common_sizes`: of the same size in all cameras."""
-    ended = np.where(batch.finite, rows["status"], NOT_FINITE)
-    forms, traced = solved.forms(), solved.traced(common_sizes)
-    forms.q[ended != CONVERGED] = np.nan
+    status = np.where(batch.finite, rows["status"], NOT_FINITE)
+    forms, is_traced = solved_portions.forms(), solved_portions.traced(common_sizes)
+    forms.q[status != CONVERGED] = np.nan
     # Without residuals everything is zero, as it is classically.
     variance = rows["sigma0"] ** 2
     factor = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
     interior = factor[:, None, None] * rows["covariance"]
     sigma = np.concatenate([rows["sigma_position"], rows["sigma_angles"]], -1)
     pose = factor[:, None, None] * sigma**2
-    traces = solved.traces(traced)
-    sums = BatchSums(forms, traces, traced, rows["redundancy"], interior, pose)
+    traces = solved_portions.traces(is_traced)
+    sums = BatchSums(forms, traces, is_traced, rows["redundancy"], interior, pose)
     views = rows["views"].sum(1)
     points = (rows["redundancy"] + len(batch.free) + POSE * views) // 2
-    programs = BatchPrograms(solved.scatter, solved.parts)
+    programs = BatchPrograms(solved_portions.scatter, solved_portions.parts)
     errors = batch_errors(sums, views, points, common_sizes, programs)
     diagonal = np.diagonal(errors.covariance, axis1=1, axis2=2)
     return {
@@ -232,14 +234,14 @@ def _under_errors(batch: Batch, rows: Rows, solved: SolvedPortions, common_sizes
 
 
 def _undetermined(
-    model: CameraModel, batch: Batch, ended: Int[np.ndarray, " cameras"], rows: Rows
+    model: CameraModel, batch: Batch, status: Int[np.ndarray, " cameras"], rows: Rows
 ) -> Bool[np.ndarray, "cameras k"]:
     """Undetermined parameters, of cameras for which they can be found."""
     sigma = rows["sigma"]
-    null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
+    null = vanishing(rows["reduced"]) & np.isin(status, (SINGULAR, LIMIT))[:, None]
     # At the limit the last σ say why, if the equations can be solved.
-    is_known = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
-    return np.where(is_known[:, None], is_vague(model, batch.free, rows["interior"], sigma), null)
+    has_sigma = (status == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (status == CONVERGED)
+    return np.where(has_sigma[:, None], is_vague(model, batch.free, rows["interior"], sigma), null)
 
 
 def _snoop(
@@ -255,45 +257,45 @@ def _snoop(
     A camera without a solution is tested where its iterations ended, since blunders may be the
     cause. If it has no solution without them either, it is unchanged.
     """
-    weight = np.asarray(portion.seen.weight)
-    cameras = [Snooping(observed > 0, test, significance) for observed in weight]
-    open_ones = np.arange(len(portion.cameras))
+    weight = np.asarray(portion.sightings.weight)
+    cameras = [Snooping(camera_weight > 0, test, significance) for camera_weight in weight]
+    open_cameras = np.arange(len(portion.cameras))
     first_rows = {name: values.copy() for name, values in rows.items()}
     failures = np.zeros(len(weight), int)
     for _ in range(MAX_ROUNDS):
         is_used = np.stack([camera.used for camera in cameras]).astype(float)
         unknowns = CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
         tests = np.asarray(
-            tests_of_points(key, in_double(portion.seen), is_used, unknowns, rows["views"])
+            tests_of_points(key, in_double(portion.sightings), is_used, unknowns, rows["views"])
         )
         tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
         failures += rows["status"] != CONVERGED
         # A camera without a solution goes on for 60 rounds, in each of which it loses at most a
         # point of every view; larger or smaller: the time until it is given up.
-        open_ones = np.array(
+        open_cameras = np.array(
             [
                 i
-                for i in open_ones
+                for i in open_cameras
                 if tested[i]
                 and failures[i] <= 60
                 and cameras[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
             ],
             int,
         )
-        if not len(open_ones):
+        if not len(open_cameras):
             break
         # The others get no points: they end at once as "too few points", and keep their rows.
-        weight_left = np.zeros_like(weight)
-        weight_left[open_ones] = [cameras[i].used for i in open_ones]
-        observed = dataclasses.replace(portion.seen, weight=weight_left)
-        solved_again = solve(dataclasses.replace(portion, seen=observed))
+        open_weight = np.zeros_like(weight)
+        open_weight[open_cameras] = [cameras[i].used for i in open_cameras]
+        sightings = dataclasses.replace(portion.sightings, weight=open_weight)
+        solved_again = solve(dataclasses.replace(portion, sightings=sightings))
         for name, values in rows.items():
-            values[open_ones] = solved_again[name][open_ones]
+            values[open_cameras] = solved_again[name][open_cameras]
     # Neither with nor without: nothing says that the removed points are blunders.
-    is_lost = (first_rows["status"] != CONVERGED) & (rows["status"] != CONVERGED)
+    is_unsolved = (first_rows["status"] != CONVERGED) & (rows["status"] != CONVERGED)
     for name, values in rows.items():
-        values[is_lost] = first_rows[name][is_lost]
-    for i in np.flatnonzero(is_lost):
+        values[is_unsolved] = first_rows[name][is_unsolved]
+    for i in np.flatnonzero(is_unsolved):
         cameras[i].used = cameras[i].seen
     rows["removed"] = np.stack([camera.seen & ~camera.used for camera in cameras])
     return rows

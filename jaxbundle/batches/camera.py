@@ -67,7 +67,7 @@ class CameraSolution(eqx.Module):
     """The end of the iterations: unknowns, ½vᵀv, cofactors, the scaled reduced normal matrix,
     redundancy, views used, the index of the status in `STATUS`, number of evaluations."""
 
-    at: CameraUnknowns
+    unknowns: CameraUnknowns
     cost: Float[Array, ""]
     interior_cofactors: Float[Array, "k k"]
     pose_cofactors: Float[Array, "views 6 6"]
@@ -103,22 +103,22 @@ def solve_camera(
         return N, jnp.where(jnp.all(jnp.isfinite(N)), 0.5 * jnp.sum(N[:, -1, -1]), jnp.nan)
 
     # Stopped before the first step: without redundancy the residuals vanish whatever the camera.
-    is_few = (redundancy < 1) | ~jnp.any(views)
+    has_too_few = (redundancy < 1) | ~jnp.any(views)
     loop = iterate(
         linearise,
         lambda N, damping: _change(N, views, damping),
-        lambda at, d: retract(free, at, *d),
+        lambda unknowns, d: retract(free, unknowns, *d),
         start,
         lambda _: tolerance,
         max_steps,
-        ~is_few,
+        ~has_too_few,
     )
     # Undamped: damping would make singular equations look determined.
     factor = factorise(loop.equations, views, 0.0)
     Q_interior, Q_pose, weakest = cofactors(factor)
     meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])
-    status = jnp.where(is_few, TOO_FEW, meaning[loop.termination])
-    is_lost = (status == CONVERGED) & ~(weakest > INDETERMINATE)
+    status = jnp.where(has_too_few, TOO_FEW, meaning[loop.termination])
+    is_indeterminate = (status == CONVERGED) & ~(weakest > INDETERMINATE)
     # A settled step is taken without being tried, as by the engine; another may yet be rejected.
     settled = loop.termination == stopping.SETTLED
     return CameraSolution(
@@ -133,7 +133,7 @@ def solve_camera(
         factor.reduced,
         redundancy,
         views,
-        jnp.where(is_lost, SINGULAR, status),
+        jnp.where(is_indeterminate, SINGULAR, status),
         loop.steps,
     )
 

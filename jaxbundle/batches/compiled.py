@@ -39,7 +39,7 @@ class ProgramKey(NamedTuple):
 
     model: CameraModel
     free: tuple[int, ...]
-    known: bool
+    has_focal_length: bool
     on_cpu: bool
 
     def for_every(self, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -67,7 +67,7 @@ def tests_of_points(
 
 def solve_portion(key: ProgramKey, max_steps: int, size: float, portion: Portion) -> Rows:
     """The rows of a `BatchCalibration`, with the status as its number."""
-    data = in_double(portion.seen), portion.interior, portion.axes, portion.middle
+    data = in_double(portion.sightings), portion.interior, portion.axes, portion.middle
     result = _portion_program(key, portion.flat, max_steps, size, *data)
     return jax.tree.map(np.array, result)
 
@@ -92,9 +92,9 @@ def _portion_program(
 
     def calibrate(arguments: tuple[Sightings, Array]) -> tuple[CameraSolution, Float[Array, ""]]:
         sightings, interior = arguments
-        usable, start = start_values(model, flat, key.known, sightings, interior, size)
+        usable, start = start_values(model, flat, key.has_focal_length, sightings, interior, size)
         solved = solve_camera(model, free, max_steps, size, usable, start)
-        return solved, jnp.sum(residual_lengths(model, usable, solved.at))
+        return solved, jnp.sum(residual_lengths(model, usable, solved.unknowns))
 
     solved, lengths = key.for_every(calibrate)((sightings, interior))
     # A posteriori, since nobody stated a σ: Σ = σ0²·Q. The number of points follows from the
@@ -104,20 +104,20 @@ def _portion_program(
     points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))
     rotation, position, angles, pose_sigma = jax.vmap(
         jax.vmap(_exterior_orientation, (0, 0, 0, None, None))
-    )(solved.at.rotation, solved.at.shift, solved.pose_cofactors, axes, middle)
+    )(solved.unknowns.rotation, solved.unknowns.shift, solved.pose_cofactors, axes, middle)
     pose_sigma = jnp.sqrt(variance)[:, None, None] * pose_sigma
     return dict(
         status=solved.status,
-        values=solved.at.interior[:, jnp.array(free)],
+        values=solved.unknowns.interior[:, jnp.array(free)],
         sigma=jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2)),
         covariance=covariance,
         reduced=solved.reduced,
-        interior=solved.at.interior,
+        interior=solved.unknowns.interior,
         sigma0=jnp.sqrt(variance),
         rms=jnp.sqrt(2 * solved.cost / points),
         mean_length=lengths / points,
-        quaternion=solved.at.rotation,
-        shift=solved.at.shift,
+        quaternion=solved.unknowns.rotation,
+        shift=solved.unknowns.shift,
         redundancy=solved.redundancy,
         iterations=solved.steps,
         views=solved.views,

@@ -52,7 +52,7 @@ def epoch_keys(
         return numbers[-1].lstrip("0") or "0" if numbers else ""
 
     # Equal names first: numbers of two cameras may be equal by chance.
-    some = None
+    fallback = None
     for key in (without_suffix, number):
         keys = {
             camera: [key(name) for name in names_of_camera]
@@ -67,10 +67,10 @@ def epoch_keys(
             return keys
         if are_unique and len(keys) > 2 and _connected(keys):
             return keys
-        if are_unique and some is None and not connected and _any_shared(keys):
-            some = keys
-    if some is not None:
-        return some
+        if are_unique and fallback is None and not connected and _any_shared(keys):
+            fallback = keys
+    if fallback is not None:
+        return fallback
     names_in_words = "; ".join(
         f"{camera}: {list_some(names_of_camera, 2)}" for camera, names_of_camera in names.items()
     )

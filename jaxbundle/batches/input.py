@@ -55,7 +55,7 @@ class Portion:
     cameras: np.ndarray
     views: np.ndarray
     flat: bool
-    seen: Sightings
+    sightings: Sightings
     interior: np.ndarray
     axes: np.ndarray
     middle: np.ndarray
@@ -127,7 +127,7 @@ class Batch:
     visible: np.ndarray
     interior: np.ndarray
     free: tuple[int, ...]
-    known: bool
+    has_focal_length: bool
     image_size: np.ndarray
 
     @property
@@ -186,7 +186,7 @@ class Batch:
             visible=visible,
             interior=interior,
             free=tuple(model.parameters.index(name) for name in free),
-            known=has_focal_length,
+            has_focal_length=has_focal_length,
             image_size=size.astype(float),
         )
 

@@ -81,32 +81,34 @@ def misfits(
         log = np.log(np.maximum(rms[solved], settings.negligible))
         scatter = NORMAL_SIGMA_BY_MAD * np.median(np.abs(log - np.median(log)))
         factor = np.exp(max(np.log(settings.min_ratio), settings.max_deviations * scatter))
-    return is_misfit | (rms > factor * rms_beside(rms, solved, settings))
+    return is_misfit | (rms > factor * reference_rms(rms, solved, settings))
 
 
-def rms_beside(
+def reference_rms(
     rms: Float[np.ndarray, " cameras"],
     solved: Bool[np.ndarray, " cameras"],
     settings: MisfitSettings = DEFAULTS,
 ) -> Float[np.ndarray, " cameras"]:
     """The reference of the RMS of each solved camera: the median of all, for few cameras the
     smallest of the others; NaN for a single camera, and one without a solution."""
-    beside = np.full(len(rms), np.nan)
-    some = np.maximum(rms[solved], settings.negligible)
-    if len(some) >= settings.min_cameras:
-        beside[solved] = np.median(some)
-    elif len(some) > 1:
-        smallest, second_smallest = np.sort(some)[:2]
-        beside[solved] = np.where(np.arange(len(some)) == some.argmin(), second_smallest, smallest)
-    return beside
+    reference = np.full(len(rms), np.nan)
+    solved_rms = np.maximum(rms[solved], settings.negligible)
+    if len(solved_rms) >= settings.min_cameras:
+        reference[solved] = np.median(solved_rms)
+    elif len(solved_rms) > 1:
+        smallest, second_smallest = np.sort(solved_rms)[:2]
+        reference[solved] = np.where(
+            np.arange(len(solved_rms)) == solved_rms.argmin(), second_smallest, smallest
+        )
+    return reference
 
 
-def rms_remark(rms: float, beside: float) -> str:
+def rms_remark(rms: float, reference: float) -> str:
     """A remark if the RMS is far above that of the other cameras."""
-    if not rms > DEFAULTS.min_ratio * beside:
+    if not rms > DEFAULTS.min_ratio * reference:
         return ""
     return (
-        f"RMS {rms:.2g} px against {beside:.2g} px of the others: wrong points may be why "
+        f"RMS {rms:.2g} px against {reference:.2g} px of the others: wrong points may be why "
         "parameters are not determined"
     )
 
@@ -202,12 +204,12 @@ def remarks(
             f"{frame[0]:g} × {frame[1]:g} pixels: is image_size right (width, height), or are x "
             "and y exchanged?"
         )
-    beside = rms_beside(rows["rms"], np.isfinite(rows["rms"]))
+    reference = reference_rms(rows["rms"], np.isfinite(rows["rms"]))
     vague = rows["undetermined"].any(1)
     for camera in np.flatnonzero(~good & batch.finite):
         xy = batch.xy[camera][batch.visible[camera]]
         remarks_of_camera = [axes_remark(xy, frame, model.axes == "down")]
         if vague[camera]:
-            remarks_of_camera.append(rms_remark(rows["rms"][camera], beside[camera]))
+            remarks_of_camera.append(rms_remark(rows["rms"][camera], reference[camera]))
         remark[camera] = "; ".join(filter(None, remarks_of_camera))
     return np.array(remark)

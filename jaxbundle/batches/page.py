@@ -42,13 +42,16 @@ def compose_batch(
 
 
 def _describe(
-    population: Population, origin: Origin, against: Mapping[str, np.ndarray], addition: Addition
+    population: Population,
+    origin: Origin,
+    further_columns: Mapping[str, np.ndarray],
+    addition: Addition,
 ) -> Page:
     sections = [
         *addition.sections,
         *_rms(population),
         *_parameters(population),
-        *_correlations(population, against),
+        *_correlations(population, further_columns),
         *_outlying(population),
     ]
     counts = Counter(population.status.tolist()).most_common()
@@ -56,7 +59,9 @@ def _describe(
     status_table = "<h3>Status</h3>\n", grid(("status", "number", "%"), states)
     verdict_section = give_verdict([*addition.findings, *_judge(population)], (), *status_table)
     title = f"{count(len(population), 'input')}: batch"
-    listing = Listing("Results", _columns(population, against), "", "One row a camera or network.")
+    listing = Listing(
+        "Results", _columns(population, further_columns), "", "One row a camera or network."
+    )
     return Page(title, [verdict_section, *sections], origin, tables={"results": listing})
 
 
@@ -86,15 +91,15 @@ def _rms(population: Population) -> list[Section]:
     values = values[np.isfinite(values)]
     if not len(values):
         return []
-    middle = float(np.median(values))
+    median = float(np.median(values))
     # From 0, so that heights of two batches compare, and without the tail of a few misfits.
-    top = max(min(3 * middle, float(values.max())), 1e-12)
+    top = max(min(3 * median, float(values.max())), 1e-12)
     edges = np.linspace(0, top, 25)
     has_above = (values > top).any()
     edges = np.append(edges, np.inf) if has_above else edges
     counted = np.histogram(values, edges)[0]
     caption = (
-        f"{len(values)} results with values; median {significant(middle)}, largest "
+        f"{len(values)} results with values; median {significant(median)}, largest "
         f"{significant(float(values.max()))}" + ("; the last class is open" if has_above else "")
     )
     drawing = figure(draw_histogram(edges, counted, label, "number of inputs"), caption)
@@ -104,16 +109,22 @@ def _rms(population: Population) -> list[Section]:
 def _parameters(population: Population) -> list[Section]:
     rows = []
     for name, values in population.values.items():
-        middle, deviation = population.spread(values)
+        median, robust_sigma = population.spread(values)
         sigma = population.spread(population.sigma[name])[0]
         finite_values = values[population.fit & np.isfinite(values)]
         if len(finite_values):
             ends = (
-                significant(x, digits_of(x, deviation))
+                significant(x, digits_of(x, robust_sigma))
                 for x in (finite_values.min(), finite_values.max())
             )
             rows.append(
-                (name, len(finite_values), *estimate(middle, deviation), significant(sigma), *ends)
+                (
+                    name,
+                    len(finite_values),
+                    *estimate(median, robust_sigma),
+                    significant(sigma),
+                    *ends,
+                )
             )
     if not rows:
         return []
@@ -138,9 +149,11 @@ def _histograms(population: Population) -> Iterator[str]:
             )
 
 
-def _correlations(population: Population, against: Mapping[str, np.ndarray]) -> list[Section]:
+def _correlations(
+    population: Population, further_columns: Mapping[str, np.ndarray]
+) -> list[Section]:
     """Correlations of parameters."""
-    correlations = population.correlations(against)
+    correlations = population.correlations(further_columns)
     if not correlations:
         return []
     level = population.settings.level / len(correlations)
@@ -173,14 +186,14 @@ def _correlations(population: Population, against: Mapping[str, np.ndarray]) -> 
 
 def _outlying(population: Population) -> list[Section]:
     """Inputs that need attention: those without a result first, then misfits, then the farthest."""
-    reasons = population.outlying()
-    if not reasons:
+    rows_and_reasons = population.outlying()
+    if not rows_and_reasons:
         return []
     rows = [
-        (population.keys[i], significant(population.numbers["rms"][i], 4), words)
-        for i, words in reasons[:30]  # a screen or two; the table has all
+        (population.keys[i], significant(population.numbers["rms"][i], 4), reason)
+        for i, reason in rows_and_reasons[:30]  # a screen or two; the table has all
     ]
-    number_of_others = len(reasons) - len(rows)
+    number_of_others = len(rows_and_reasons) - len(rows)
     note = paragraph(f"and {number_of_others} more: sort the table.") if number_of_others else ""
     return [
         Section(
@@ -192,7 +205,9 @@ def _outlying(population: Population) -> list[Section]:
     ]
 
 
-def _columns(population: Population, against: Mapping[str, np.ndarray]) -> dict[str, Column]:
+def _columns(
+    population: Population, further_columns: Mapping[str, np.ndarray]
+) -> dict[str, Column]:
     places = {"rms": "RMS [px]", "sigma0": "σ0"}
     columns = {
         "id": Column(population.keys, "input"),
@@ -211,6 +226,7 @@ def _columns(population: Population, against: Mapping[str, np.ndarray]) -> dict[
     if np.isfinite(population.farthest).any():
         columns["farthest"] = Column(population.farthest, "largest deviation [robust σ]", 1)
     columns |= {
-        f"with {n}": Column(values, n, -DIGITS_WITHOUT_SIGMA, True) for n, values in against.items()
+        f"with {n}": Column(values, n, -DIGITS_WITHOUT_SIGMA, True)
+        for n, values in further_columns.items()
     }
     return columns | {"remark": Column(population.remark, "remark")}

@@ -71,13 +71,13 @@ class PhotographFolders:
 
     folders: Sequence[str]
     board: Board
-    kept: KeptCorners
+    kept_corners: KeptCorners
     workers: Workers
 
     def fingerprint(self, folder: int) -> str:
         """The fingerprint of the content of the photographs of a folder."""
         files = self._files(folder)
-        return of_words(f"{name} {self.kept.content(path)}" for name, path in files.items())
+        return of_words(f"{name} {self.kept_corners.content(path)}" for name, path in files.items())
 
     def measure(
         self, folders: Sequence[int], tell: Callable[[float], None] = lambda _: None
@@ -88,31 +88,34 @@ class PhotographFolders:
         files = {folder: self._files(folder) for folder in folders}
         # By content, not by name: a photograph copied to two folders is searched once.
         contents = {
-            path: self.kept.content(path)
+            path: self.kept_corners.content(path)
             for files_of_folder in files.values()
             for path in files_of_folder.values()
         }
         tasks = {
             content: (path, self.board)
             for path, content in contents.items()
-            if content and self.kept.look(content, self.board) is None
+            if content and self.kept_corners.look(content, self.board) is None
         }
-        died: dict[str, NotSearched] = {}
+        not_searched: dict[str, NotSearched] = {}
         for number_done, (task, look) in enumerate(self.workers.run(tasks.values()), 1):
             content = contents[task[0]]
             if isinstance(look, Failed):
-                died[content] = NotSearched(look.why)  # not kept: another run may have more memory
+                # Not kept: another run may have more memory.
+                not_searched[content] = NotSearched(look.why)
             else:
-                self.kept.keep(content, self.board, look)
+                self.kept_corners.keep(content, self.board, look)
             tell(number_done / len(tasks))
-        return {folder: self._views(folder, files[folder], contents, died) for folder in folders}
+        return {
+            folder: self._views(folder, files[folder], contents, not_searched) for folder in folders
+        }
 
     def _views(
         self,
         folder: int,
         files: Mapping[str, Path],
         contents: Mapping[Path, str],
-        died: Mapping[str, NotSearched],
+        not_searched: Mapping[str, NotSearched],
     ) -> BoardViews | str:
         if not files:
             return _why_empty(self.folders[folder])
@@ -125,11 +128,15 @@ class PhotographFolders:
                 if not content
                 else f"is the same file as {first_of_content[content]}"
                 if content in first_of_content
-                else died.get(content) or self.kept.look(content, self.board) or "was not searched"
+                else not_searched.get(content)
+                or self.kept_corners.look(content, self.board)
+                or "was not searched"
             )
             first_of_content.setdefault(content, name)
         try:
-            return collect_views(files, looks, self.board, hints=not {*died} & {*first_of_content})
+            return collect_views(
+                files, looks, self.board, hints=not {*not_searched} & {*first_of_content}
+            )
         except InputError as error:
             return str(error)
 
@@ -146,8 +153,7 @@ def _why_empty(folder: str | Path) -> str:
         return "no photographs in this folder"
     return (
         f"no photographs in this folder, but in {list_some(folders_inside, 3, str)} in it: give "
-        "--rig "
-        "for cameras on one mounting, or these folders"
+        "--rig for cameras on one mounting, or these folders"
     )
 
 

@@ -66,15 +66,15 @@ class Correlation:
 
 
 class Population:
-    """Columns over all rows of a batch (`batch.run.result_rows`): `keys`, `status`, `remark`,
+    """Columns over all rows of a batch (`batches.result_rows`): `keys`, `status`, `remark`,
     `numbers` by name; the `models` of cameras; their parameters, `values`, with their `sigma`, and
     their deviations `apart` from the median, in robust standard deviations; `rms_apart`, signed."""
 
     def __init__(self, rows: Iterable[Mapping], settings: PopulationSettings | None = None):
         self.settings = settings or PopulationSettings()
         kept_rows = [_row(row) for row in rows]
-        words = lambda name: np.array([str(row.get(name, "")) for row in kept_rows], dtype=object)
-        self.keys, self.status, self.remark = (words(n) for n in ("key", "status", "remark"))
+        texts = lambda name: np.array([str(row.get(name, "")) for row in kept_rows], dtype=object)
+        self.keys, self.status, self.remark = (texts(n) for n in ("key", "status", "remark"))
         self.numbers = {name: numbers(row.get(name) for row in kept_rows) for name in NUMBERS}
         self.models = {model for row in kept_rows for model in row["models"]}
         names = dict.fromkeys(name for row in kept_rows for name in row["parameters"])
@@ -108,21 +108,21 @@ class Population:
 
     def spread(self, values: np.ndarray) -> tuple[float, float]:
         """Median and robust standard deviation over the population."""
-        known_values = values[self.fit & np.isfinite(values)]
-        if not len(known_values):
+        finite_values = values[self.fit & np.isfinite(values)]
+        if not len(finite_values):
             return np.nan, np.nan
-        middle = float(np.median(known_values))
-        return middle, NORMAL_SIGMA_BY_MAD * float(np.median(np.abs(known_values - middle)))
+        median = float(np.median(finite_values))
+        return median, NORMAL_SIGMA_BY_MAD * float(np.median(np.abs(finite_values - median)))
 
     def _deviations(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-        middle, deviation = self.spread(values)
+        median, robust_sigma = self.spread(values)
         number = (self.fit & np.isfinite(values)).sum()
-        if number < self.settings.min_cameras or not deviation > 0:
+        if number < self.settings.min_cameras or not robust_sigma > 0:
             return np.full(len(values), np.nan)
         # s contains the usual σ already; only what a camera has on top of it widens its limit
-        usual = np.nan_to_num(self.spread(sigma)[0])
-        worse = np.maximum(np.nan_to_num(sigma) ** 2 - usual**2, 0.0)
-        return (values - middle) / np.sqrt(deviation**2 + worse)
+        median_sigma = np.nan_to_num(self.spread(sigma)[0])
+        additional_variance = np.maximum(np.nan_to_num(sigma) ** 2 - median_sigma**2, 0.0)
+        return (values - median) / np.sqrt(robust_sigma**2 + additional_variance)
 
     @property
     def farthest(self) -> np.ndarray:
@@ -149,11 +149,11 @@ class Population:
     def outlying(self) -> list[tuple[int, str]]:
         """Rows that need attention, with the reason: without a result first, then weak ones and
         misfits, then the farthest."""
-        reasons = [(i, self.why_outlying(i)) for i in range(len(self))]
+        rows_and_reasons = [(i, self.why_outlying(i)) for i in range(len(self))]
         farthest, rms = np.nan_to_num(self.farthest), np.nan_to_num(self.numbers["rms"])
-        reasons = [(i, words) for i, words in reasons if words]
+        rows_and_reasons = [(i, reason) for i, reason in rows_and_reasons if reason]
         return sorted(
-            reasons,
+            rows_and_reasons,
             key=lambda item: (
                 bool(self.solved[item[0]]),
                 bool(self.fit[item[0]]),
@@ -165,33 +165,33 @@ class Population:
     def histogram(self, values: np.ndarray) -> tuple[Float[np.ndarray, " edges"], np.ndarray]:
         """Edges and counts of classes over the population, the outer ones open if values lie
         beyond."""
-        known_values = values[self.fit & np.isfinite(values)]
-        if not len(known_values):
+        finite_values = values[self.fit & np.isfinite(values)]
+        if not len(finite_values):
             return np.zeros(0), np.zeros(0, int)
-        middle, deviation = self.spread(values)
-        smallest, greatest = float(known_values.min()), float(known_values.max())
-        if deviation > 0:
-            reach = self.settings.half_width * deviation
-            smallest, greatest = max(smallest, middle - reach), min(greatest, middle + reach)
+        median, robust_sigma = self.spread(values)
+        smallest, greatest = float(finite_values.min()), float(finite_values.max())
+        if robust_sigma > 0:
+            reach = self.settings.half_width * robust_sigma
+            smallest, greatest = max(smallest, median - reach), min(greatest, median + reach)
         if not greatest > smallest:
             smallest, greatest = smallest - 0.5, greatest + 0.5
         edges = np.linspace(smallest, greatest, self.settings.classes + 1)
-        edges[0] = -np.inf if known_values.min() < smallest else edges[0]
-        edges[-1] = np.inf if known_values.max() > greatest else edges[-1]
-        return edges, np.histogram(known_values, edges)[0]
+        edges[0] = -np.inf if finite_values.min() < smallest else edges[0]
+        edges[-1] = np.inf if finite_values.max() > greatest else edges[-1]
+        return edges, np.histogram(finite_values, edges)[0]
 
     def correlations(self, against: Mapping[str, np.ndarray]) -> list[Correlation]:
         """Correlations of every parameter and the RMS with every column of `against` (a number per
         row, NaN if missing), the most significant first."""
         correlations = []
-        for column, with_it in against.items():
+        for column, column_values in against.items():
             for name, values in {**self.values, "rms": self.numbers["rms"]}.items():
-                is_used = self.fit & np.isfinite(values) & np.isfinite(with_it)
+                is_used = self.fit & np.isfinite(values) & np.isfinite(column_values)
                 varies = lambda x, is_used=is_used: np.ptp(x[is_used]) > 0
                 has_enough = is_used.sum() >= self.settings.min_cameras
-                if has_enough and varies(with_it) and varies(values):
+                if has_enough and varies(column_values) and varies(values):
                     correlations.append(
-                        _correlation(column, name, with_it[is_used], values[is_used])
+                        _correlation(column, name, column_values[is_used], values[is_used])
                     )
         return sorted(
             correlations,
@@ -204,17 +204,17 @@ class Population:
         columns = {**self.values, "rms": self.numbers["rms"]}
         parameters = {}
         for name, values in columns.items():
-            known_values = values[self.fit & np.isfinite(values)]
-            if not len(known_values):
+            finite_values = values[self.fit & np.isfinite(values)]
+            if not len(finite_values):
                 continue
-            middle, deviation = self.spread(values)
+            median, robust_sigma = self.spread(values)
             edges, counted = self.histogram(values)
             parameters[name] = {
-                "cameras": len(known_values),
-                "median": middle,
-                "robust_sigma": deviation,
-                "least": float(known_values.min()),
-                "greatest": float(known_values.max()),
+                "cameras": len(finite_values),
+                "median": median,
+                "robust_sigma": robust_sigma,
+                "least": float(finite_values.min()),
+                "greatest": float(finite_values.max()),
                 "histogram": {"edges": edges.tolist(), "numbers": counted.tolist()},
             }
             if name in self.sigma:
@@ -254,40 +254,40 @@ def _row(row: Mapping) -> dict:
     cameras = (row.get("cameras") or {}).values()
     used_entries["models"] = {row.get("model"), *(c.get("model") for c in cameras)} - {None}
     return used_entries | {
-        "parameters": row["parameters"] if "parameters" in row else _of_network(row)
+        "parameters": row["parameters"] if "parameters" in row else _estimates_of_network(row)
     }
 
 
-def _of_network(row: Mapping) -> dict[str, dict]:
+def _estimates_of_network(row: Mapping) -> dict[str, dict]:
     """Estimates of a network that are not held and belong to no single image: free parameters of
     its cameras (with the camera's id where there are several), mountings, boresights and the
     like."""
-    estimates_found, cameras = {}, row.get("cameras") or {}
+    estimate_of, cameras = {}, row.get("cameras") or {}
     for id, camera in cameras.items():
         for name, estimate in camera["parameters"].items():
             if estimate.get("free"):
-                estimates_found[name if len(cameras) == 1 else f"{id} {name}"] = estimate
+                estimate_of[name if len(cameras) == 1 else f"{id} {name}"] = estimate
     for table, unknowns in (row.get("further_unknowns") or {}).items():
         for object_id, estimates in unknowns.items():
             if object_id not in row.get("images", {}):
-                estimates_found |= {
+                estimate_of |= {
                     f"{table} {object_id} {name}": estimate
                     for name, estimate in estimates.items()
                     if estimate["sigma"] != 0
                 }
-    return estimates_found
+    return estimate_of
 
 
 def _correlation(
-    column: str, name: str, with_it: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]
+    column: str, name: str, column_values: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]
 ) -> Correlation:
     n = len(values)
-    r = float(np.corrcoef(_ranks(with_it), _ranks(values))[0, 1])
-    square = r * r * (n - 2) / max(1 - r * r, 1e-300)
+    r = float(np.corrcoef(_ranks(column_values), _ranks(values))[0, 1])
+    t_squared = r * r * (n - 2) / max(1 - r * r, 1e-300)
     # A rank correlation has no unit: the change of the median says how much it matters.
-    upper = with_it > np.median(with_it)
+    upper = column_values > np.median(column_values)
     change = np.median(values[upper]) - np.median(values[~upper]) if upper.any() else np.nan
-    return Correlation(column, name, n, r, f_tail(square, 1, n - 2), float(change))
+    return Correlation(column, name, n, r, f_tail(t_squared, 1, n - 2), float(change))
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:

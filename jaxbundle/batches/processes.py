@@ -124,25 +124,25 @@ def add_parts(file: str | Path) -> None:
         for path in glob.glob(f"{glob.escape(str(file))}.part-*")
         if (end := re.search(r"\.part-(\d+)-of-\d+$", path))
     ]
-    waited = glob.glob(f"{glob.escape(str(file))}.joined-*")
-    if not parts_found and not waited:
+    waiting_folders = glob.glob(f"{glob.escape(str(file))}.joined-*")
+    if not parts_found and not waiting_folders:
         return
     with ExitStack() as locks:
         locks.enter_context(hold_lock(file))
         for _, path in parts_found:
             locks.enter_context(hold_lock(path))
         parts = [JsonLines(path) for _, path in sorted(parts_found)]
-        lines, some = JsonLines(file), []
+        lines, rows_to_write = JsonLines(file), []
         # Parts have every N-th input: taken in turn they are in the order of the inputs.
         in_turn = chain.from_iterable(zip_longest(*(part.rows(part.heads) for part in parts)))
         for row in in_turn:
             if row is not None and row["key"] not in lines:
-                some.append(row)
-            if len(some) == 256:  # lines a write: bounds the memory
-                lines.append(some)
-                some = []
-        lines.append(some)
+                rows_to_write.append(row)
+            if len(rows_to_write) == 256:  # lines a write: bounds the memory
+                lines.append(rows_to_write)
+                rows_to_write = []
+        lines.append(rows_to_write)
         for _, path in parts_found:
             os.remove(path)
-    for path in waited:
+    for path in waiting_folders:
         shutil.rmtree(path, ignore_errors=True)

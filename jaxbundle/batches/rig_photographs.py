@@ -26,7 +26,7 @@ class RigFolders:
 
     folders: Sequence[str]
     board: Board
-    kept: KeptCorners
+    kept_corners: KeptCorners
     workers: Workers
 
     def fingerprint(self, rig: int) -> str:
@@ -51,23 +51,23 @@ class RigFolders:
         of_rig: dict[int, dict[str, BoardViews | str]] = {i: {} for i in rigs}
         for (i, path), views_or_reason in zip(all_folders, views.values()):
             of_rig[i][path.name] = views_or_reason
-        return {i: _rig(folders_of_rig) for i, folders_of_rig in of_rig.items()}
+        return {i: _rig(views_of_rig) for i, views_of_rig in of_rig.items()}
 
     def _folders_of(self, folders: Sequence[str]) -> PhotographFolders:
-        return PhotographFolders(folders, self.board, self.kept, self.workers)
+        return PhotographFolders(folders, self.board, self.kept_corners, self.workers)
 
 
 def _rig(views: Mapping[str, BoardViews | str]) -> tuple[RigViews, dict] | str:
     if len(views) < 2:
         only_camera = f" (only {[*views][0]})" if views else ""
         return f"expected a folder of photographs for every camera of the rig here{only_camera}"
-    bad = [
+    reasons = [
         f"camera {name}: {views_of_camera}"
         for name, views_of_camera in views.items()
         if isinstance(views_of_camera, str)
     ]
-    if bad:
-        return "; ".join(bad)
+    if reasons:
+        return "; ".join(reasons)
     usable_views = {
         name: views_of_camera
         for name, views_of_camera in views.items()

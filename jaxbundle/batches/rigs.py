@@ -163,14 +163,14 @@ def _adjust(
         return result, excluded
     # Epochs first: a board that moved shifts all points of an epoch, and point by point data
     # snooping would remove the cameras that are right as well.
-    while result.converged and (bad := _contradicting(rig, result, settings)):
+    while result.converged and (contradictions := _contradicting(rig, result, settings)):
         excluded |= {
             rig.epochs[e]: f"does not fit the mounting (RMS {rms:.1f} px): photographs "
             "not simultaneous?"
-            for e, rms in bad.items()
+            for e, rms in contradictions.items()
         }
         xy = rig.xy.copy()
-        xy[:, list(bad)] = np.nan
+        xy[:, list(contradictions)] = np.nan
         rig = dataclasses.replace(rig, xy=xy)
         try:
             network = declare_rig(rig, firsts, settings)
@@ -188,8 +188,10 @@ def _adjust(
 
 def _contradicting(rig: RigViews, result: Adjustment, settings: RigSettings) -> dict[int, float]:
     """Epochs that contradict the mounting, and their RMS, pixels."""
-    place = {id: e for images_of_epoch in rig.images for e, id in enumerate(images_of_epoch)}
-    epoch = np.array([place[id] for id in result.problem.network.images.id])
+    epoch_of_image = {
+        id: e for images_of_camera in rig.images for e, id in enumerate(images_of_camera)
+    }
+    epoch = np.array([epoch_of_image[id] for id in result.problem.network.images.id])
     of_ray = epoch[result.problem.image]
     lengths = settings.sigma * np.hypot(*result.inspection.image_residuals.T)
     number = np.bincount(of_ray, minlength=len(rig.epochs))

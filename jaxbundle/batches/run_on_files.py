@@ -221,9 +221,8 @@ def _to_recompute(
     if differing_keys and not renew:
         key, difference = next(iter(differing_keys.items()))
         raise InputError(
-            f"{lines.path}: has {len(differing_keys)} of these inputs from other settings or "
-            "other data, "
-            f"{key}: {difference}; give another file to --json-lines, or recompute them with "
+            f"{lines.path}: has {len(differing_keys)} of these inputs from other settings or other "
+            f"data, {key}: {difference}; give another file to --json-lines, or recompute them with "
             "--renew"
         )
     return [*keys_to_recompute, *differing_keys]

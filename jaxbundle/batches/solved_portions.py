@@ -122,10 +122,10 @@ class SolvedPortions(NamedTuple):
 
 def _adjusted(portion: Portion, rows: Rows) -> tuple[Sightings, CameraUnknowns]:
     """What was adjusted of a portion, with its weights, and the unknowns found."""
-    weight = np.asarray(portion.seen.weight) * rows["views"][:, :, None]
+    weight = np.asarray(portion.sightings.weight) * rows["views"][:, :, None]
     if "removed" in rows:
         weight = weight * ~rows["removed"]
-    numbers = portion.seen.point, portion.seen.xy, weight
+    numbers = portion.sightings.point, portion.sightings.xy, weight
     sightings = Sightings(*(np.asarray(x, float) for x in numbers))
     return sightings, CameraUnknowns(rows["interior"], rows["quaternion"], rows["shift"])
 

@@ -104,8 +104,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     if missing_arrays:
         raise InputError(
             f"{path}: no array {missing_arrays[0]!r}; expected {', '.join(REQUIRED_ARRAYS)} and, "
-            "if "
-            "needed, visible and ids"
+            "if needed, visible and ids"
         )
     X, xy, size = (arrays[name] for name in REQUIRED_ARRAYS)
     visible, cameras = arrays.get("visible"), _names(path, arrays, "cameras")

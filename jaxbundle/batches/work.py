@@ -74,7 +74,7 @@ class BatchSettings:
     """The checked settings of a run: those of cameras, of rigs, of networks."""
 
     model: CameraModel
-    named: str
+    model_name: str
     free: Sequence[str] | None
     board: Board | None
     rig: bool
@@ -159,7 +159,7 @@ class BatchSettings:
 
     def of_cameras(self) -> dict:
         """Settings of the lines of cameras and rigs."""
-        settings = {"model": self.named, "free": list(free_parameters(self.model, self.free))}
+        settings = {"model": self.model_name, "free": list(free_parameters(self.model, self.free))}
         settings |= {
             **self.adjusting,
             **self._correlated_setting,
@@ -254,8 +254,8 @@ def _detect(
     of_rigs = None if plain else settings.as_rigs()
     options = {"model": settings.model, "free": settings.free, **settings.of_batch}
 
-    def solve(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
-        measured = photograph_folders.measure(chosen, tell)
+    def solve(folder_rows: Sequence[int], tell: ShareDone) -> list[dict]:
+        measured = photograph_folders.measure(folder_rows, tell)
         rows = {
             i: {"status": "bad input", "error": why}
             for i, why in measured.items()
@@ -275,7 +275,7 @@ def _detect(
             rows |= {i: shorten(row, brief) for i, (row, _) in zip(views, solved)}
         for i in views:
             rows[i] |= of_photographs(views[i], brief)
-        return [rows[i] for i in chosen]
+        return [rows[i] for i in folder_rows]
 
     # The board is a setting of the lines: other corners are found with another one.
     lines = settings.of_cameras() | {"board": repr(photograph_folders.board)}
@@ -290,8 +290,8 @@ def _photographed_rigs(
 ) -> Work:
     of_rigs = settings.as_rigs()
 
-    def solve(chosen: Sequence[int], tell: ShareDone) -> list[dict]:
-        measured = rig_folders.measure(chosen, tell)
+    def solve(folder_rows: Sequence[int], tell: ShareDone) -> list[dict]:
+        measured = rig_folders.measure(folder_rows, tell)
         rows = {
             i: {"status": "bad input", "error": why}
             for i, why in measured.items()
@@ -305,7 +305,7 @@ def _photographed_rigs(
         solved = solve_rigs([rig for rig, _ in rigs.values()], of_rigs)
         for (i, (_, entries)), (row, _) in zip(rigs.items(), solved):
             rows[i] = shorten(row, settings.brief) | entries
-        return [rows[i] for i in chosen]
+        return [rows[i] for i in folder_rows]
 
     lines = settings.of_cameras() | {"board": repr(rig_folders.board)}
     return Work(
@@ -318,13 +318,11 @@ def shorten(row: dict, brief: bool) -> dict:
     if not brief or "images" not in row:
         return row
     cameras = {
-        id: {k: v for k, v in camera_or_table.items() if k != "correlations"}
-        for id, camera_or_table in row["cameras"].items()
+        id: {k: v for k, v in camera.items() if k != "correlations"}
+        for id, camera in row["cameras"].items()
     }
     further_unknowns = {
-        name: camera_or_table
-        for name, camera_or_table in row["further_unknowns"].items()
-        if name != "velocity"
+        name: estimates for name, estimates in row["further_unknowns"].items() if name != "velocity"
     }
     row = row | {
         "cameras": cameras,
@@ -335,9 +333,9 @@ def shorten(row: dict, brief: bool) -> dict:
 
 
 def _network(path: str, name: str, settings: BatchSettings) -> Work:
-    solve = lambda chosen, _: [
+    solve = lambda numbers, _: [
         network_row(path, settings.overrides, correlated=settings.correlated, **settings.adjusting)
-        for _ in chosen
+        for _ in numbers
     ]
     return Work((name,), settings.of_networks(), lambda _: of_input(path), solve, "its files", True)
 

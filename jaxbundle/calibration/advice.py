@@ -190,15 +190,14 @@ def _geometry(
     if distance.max() < settings.min_distance_ratio * distance.min():
         yield (
             f"all photographs are from nearly one distance ({distance.min():.3g} to "
-            f"{distance.max():.3g} "
-            f"{unit}): take some nearer and some farther away"
+            f"{distance.max():.3g} {unit}): take some nearer and some farther away"
         )
     number_repeated = repeated(position, rotation, distance, settings.min_move).sum()
     if number_repeated > settings.max_alike * number:
         yield (
             f"{number_repeated} of {number} photographs repeat the pose of another: they are no "
-            "further "
-            "geometry, and halves of the photographs agree too well; take them from other places"
+            "further geometry, and halves of the photographs agree too well; take them from other "
+            "places"
         )
 
 

@@ -135,8 +135,8 @@ def calibrate_opencv(
     last_coefficient = max((i for i, n in enumerate(COEFFICIENTS) if n in free_names), default=0)
     length = next(n for n in LENGTHS if n > last_coefficient)
     R, t = cv_pose(calibration.rotation[0], calibration.position[0])
-    rvecs = tuple(_rotation_vector(points_of_view)[:, None] for points_of_view in np.asarray(R))
-    tvecs = tuple(np.asarray(points_of_view)[:, None] for points_of_view in np.asarray(t))
+    rvecs = tuple(_rotation_vector(matrix)[:, None] for matrix in np.asarray(R))
+    tvecs = tuple(np.asarray(shift)[:, None] for shift in np.asarray(t))
     return OpenCVCalibration(
         (float(calibration.rms[0]), K, coefficients[None, :length], rvecs, tvecs), calibration
     )

@@ -244,7 +244,7 @@ def fill_rig(network: Network, folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     conversion_lines = [IN_BOARD_UNITS]
     for kind, (name, _) in RIG_FILES.items():
-        target, refused = TARGETS[kind], ""
+        target, refusal = TARGETS[kind], ""
         # As it is, else with the models that the format has, its best one first.
         for model in (None, *target.models[:2]):
             try:
@@ -253,7 +253,7 @@ def fill_rig(network: Network, folder: Path) -> None:
                     fitted, costs = convert_cameras(network, model)
                 losses = target.write(fitted, folder / name)
             except InputError as error:
-                refused = refused or f"{name}: not written: {error}"
+                refusal = refusal or f"{name}: not written: {error}"
                 continue
             conversion_lines += [f"{name}: camera {id!r} → {cost}" for id, cost in costs.items()]
             # The mounting itself is in every format.
@@ -269,7 +269,7 @@ def fill_rig(network: Network, folder: Path) -> None:
                 conversion_lines.append(f"{name}: one for each pair of cameras: {', '.join(parts)}")
             break
         else:
-            conversion_lines.append(refused)
+            conversion_lines.append(refusal)
     write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in conversion_lines))
 
 

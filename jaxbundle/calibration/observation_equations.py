@@ -23,13 +23,13 @@ from jaxbundle.types import AnyArray
 class LinearisedImagePoints(NamedTuple):
     """Residuals over their σ, and their derivatives.
 
-    `v` [n, 2]; `slopes`: by table, the derivatives by the changes of the row that is touched;
-    `touched`: by table, the row; `by_columns`: derivatives by held parameters of the camera.
+    `v` [n, 2]; `slopes`: by table, the derivatives by the changes of the row that is used;
+    `rows`: by table, that row; `by_columns`: derivatives by held parameters of the camera.
     """
 
     v: Float[np.ndarray, "n 2"]
     slopes: dict[str, Float[np.ndarray, "n 2 width"]]
-    touched: dict[str, Int[np.ndarray, " n"]]
+    rows: dict[str, Int[np.ndarray, " n"]]
     by_columns: Float[np.ndarray, "n 2 columns"]
 
 
@@ -68,7 +68,7 @@ def lagrange_multipliers(
     """
     tables, k = adjustment.problem.tables, B.shape[2]
     rows = {t.name: np.zeros((k, t.rows, t.space.width)) for t in tables}
-    for t, i in linearised.touched.items():
+    for t, i in linearised.rows.items():
         part = np.einsum("nrw,nrk->nkw", linearised.slopes[t], B)
         np.add.at(rows[t].swapaxes(0, 1), i, part)
     flat = B.reshape(-1, k)

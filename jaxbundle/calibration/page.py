@@ -190,7 +190,7 @@ def _models(choice: "ModelComparison") -> Section:
     return Section("models", "Camera models compared", "".join(parts), "Models")
 
 
-def _describe_several(calibrations: "Calibrations", origin: Origin, also: Addition) -> Page:
+def _describe_several(calibrations: "Calibrations", origin: Origin, addition: Addition) -> Page:
     """The common page: the verdict, the rig, the parameters of all."""
     sections, tables = [], {"cameras": _table_of_cameras(calibrations)}
     rig = calibrations.rig
@@ -221,9 +221,9 @@ def _describe_several(calibrations: "Calibrations", origin: Origin, also: Additi
             )
     remark = paragraph("Every camera has its own page in its folder of --out.")
     title = f"{KIND.capitalize()} {', '.join(map(clean, calibrations.cameras))}"
-    findings = [*conclude_calibrations(calibrations).findings, *also.findings]
+    findings = [*conclude_calibrations(calibrations).findings, *addition.findings]
     verdict_section = give_verdict(findings, (), remark)
-    return Page(title, [verdict_section, *also.sections, *sections], origin, tables=tables)
+    return Page(title, [verdict_section, *addition.sections, *sections], origin, tables=tables)
 
 
 def _rig(rig: "RigCalibration", unit: str) -> Section:

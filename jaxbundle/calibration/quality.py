@@ -217,12 +217,12 @@ def coverage(
         uv[:, 1], uv[:, 0], (rows, columns), ((-0.5, h - 0.5), (-0.5, w - 0.5))
     )
     # A corner is about a quarter of the height and a sixth of the width: nearly a square.
-    top, left = max(rows // 4, 1), max(columns // 6, 1)
+    corner_rows, corner_columns = max(rows // 4, 1), max(columns // 6, 1)
     corners = {
-        "upper left": counts[:top, :left],
-        "upper right": counts[:top, -left:],
-        "lower left": counts[-top:, :left],
-        "lower right": counts[-top:, -left:],
+        "upper left": counts[:corner_rows, :corner_columns],
+        "upper right": counts[:corner_rows, -corner_columns:],
+        "lower left": counts[-corner_rows:, :corner_columns],
+        "lower right": counts[-corner_rows:, -corner_columns:],
     }
     distance = np.linalg.norm(uv - (np.array(image_size) - 1) / 2, axis=1)
     return Coverage(
@@ -272,10 +272,10 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
         return None
     network = start_at_result(network, result)
     # Every other photograph, so that both halves have poses from all around.
-    turns = np.arange(len(network.images)) % 2
+    half_of_image = np.arange(len(network.images)) % 2
     try:
         adjust_again = partial(adjust, robust=result.robust)
-        halves = [adjust_again(take_images(network, turns == half)) for half in (0, 1)]
+        halves = [adjust_again(take_images(network, half_of_image == number)) for number in (0, 1)]
         if not all(half.converged for half in halves):
             return None
         name = network.cameras[0].id
@@ -285,10 +285,10 @@ def cross_validation(result: Adjustment) -> CrossValidation | None:
         cross_adjusted = [
             adjust_again(
                 _with_fixed_camera(
-                    take_images(network, turns == 1 - half), parameters_of_halves[half]
+                    take_images(network, half_of_image == 1 - number), parameters_of_halves[number]
                 )
             )
-            for half in (0, 1)
+            for number in (0, 1)
         ]
     except (InputError, NotSolvedError):
         return None

@@ -203,7 +203,11 @@ def as_dict(calibration: "Calibration", brief: bool = False) -> dict:
 def _boards_dict(board: Board | BoardSet) -> dict:
     """The board, or several by name."""
     if isinstance(board, BoardSet):
-        return {"boards": {name: _boards_dict(one)["board"] for name, one in board.items}}
+        return {
+            "boards": {
+                name: _boards_dict(named_board)["board"] for name, named_board in board.items
+            }
+        }
     return {
         "board": {
             "kind": board.kind,
@@ -316,10 +320,9 @@ def model_rows(comparison: "ModelComparison") -> list[tuple[str, ...]]:
 def models_legend(comparison: "ModelComparison") -> str:
     """The columns of `model_rows`."""
     return (
-        f"RMS: residuals of all photographs; left out: of those not used for the camera; Δ: images "
-        f"apart from those of {comparison.best.model}, over the whole image, rotation removed, "
-        "and RMS "
-        "over their σ. Pixels."
+        "RMS: residuals of all photographs; left out: of those not used for the camera; Δ: images "
+        f"apart from those of {comparison.best.model}, over the whole image, rotation removed, and "
+        "RMS over their σ. Pixels."
     )
 
 

@@ -97,8 +97,6 @@ def calibrate_cameras(
     calibrations = calibrate_each(photographs, calibrate_one, progress)
     rig_calibration = None
     if rig and all(calibration.converged for calibration in calibrations.values()):
-        photographs_of_camera = {
-            name: options[name] for name in (*SHARED, "robust") if name in options
-        }
-        rig_calibration = calibrate_rig(calibrations, **photographs_of_camera)
+        shared_options = {name: options[name] for name in (*SHARED, "robust") if name in options}
+        rig_calibration = calibrate_rig(calibrations, **shared_options)
     return Calibrations(calibrations, rig_calibration)

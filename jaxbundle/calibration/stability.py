@@ -298,9 +298,9 @@ def _without_rotation(
     # H·s = μ·G·s is reduced to an ordinary eigenvalue problem by a root of G. G is singular where
     # changes of parameters cancel in the image: these are dropped. 1e-12, since G holds squares:
     # they move the image by less than 1e-6 of what the others do.
-    size, U = np.linalg.eigh(G * unit)
-    is_determined = size > 1e-12 * size[-1]
-    root = U[:, is_determined] / np.sqrt(size[is_determined])
+    eigenvalues, U = np.linalg.eigh(G * unit)
+    is_determined = eigenvalues > 1e-12 * eigenvalues[-1]
+    root = U[:, is_determined] / np.sqrt(eigenvalues[is_determined])
     mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
     # μ below a tenth: nearly a rotation, as a shift of the principal point is. Larger: real changes
     # are left out too; smaller: changes count that the next orientation absorbs

@@ -47,9 +47,9 @@ def start_values(
     model: CameraModel,
     free: tuple[str, ...],
     pixel_size: tuple[float, float] | None = None,
-    given: Mapping[str, float] | None = None,
+    given_values: Mapping[str, float] | None = None,
 ) -> CalibrationStart:
-    """Start values for the adjustment of one camera; `given`: parameters known beforehand.
+    """Start values for the adjustment of one camera; `given_values`: parameters known beforehand.
 
     **Raises:** `InputError` for too few views; `NotSolvedError` if they do not determine the
     camera.
@@ -84,7 +84,7 @@ def start_values(
             )
         views = views.take(~gross, "its points do not fit those of the other photographs")
     parameters = parameters_of(
-        solved, views.xy[views.visible], views.image_size, model, free, pixel_size, given
+        solved, views.xy[views.visible], views.image_size, model, free, pixel_size, given_values
     )
     return CalibrationStart(views, parameters, solved.position, solved.angles, bool(behind.all()))
 

@@ -412,7 +412,7 @@ def test_unknowns_and_sum_of_squares_at_the_limit_are_of_one_point(three):
     def solve(seen, first):
         usable, start = start_values(model, True, False, seen, first, float(max(SIZE)))
         solved = solve_camera(model, tuple(range(9)), 1, float(max(SIZE)), usable, start)
-        return solved.cost, 0.5 * (residual_lengths(model, usable, solved.at) ** 2).sum()
+        return solved.cost, 0.5 * (residual_lengths(model, usable, solved.unknowns) ** 2).sum()
 
     first = np.zeros(len(model.parameters))
     first[2:4] = (np.array(SIZE) - 1) / 2

@@ -225,7 +225,7 @@ def test_a_view_in_the_wrong_order_is_left_out():
     lines = np.where((np.arange(54) < 5)[:, None], views.xy, np.nan)
     with pytest.raises(NotSolvedError, match="do not determine the camera .too few points"):
         start_values(dataclasses.replace(views, xy=lines), OPENCV, OPENCV.free)
-    held = start_values(views, OPENCV, ("fx", "k1"), given={"fy": 621.0})
+    held = start_values(views, OPENCV, ("fx", "k1"), given_values={"fy": 621.0})
     assert held.parameters["fy"] == 621.0 and held.parameters["k2"] == 0
 
 

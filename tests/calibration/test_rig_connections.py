@@ -153,4 +153,4 @@ def test_the_open_part_of_a_motion_moves_both_boards():
     motion = tie_by_motion(A, B)
     for one in (motion, motion.shifted(np.array([0.3, 0.7, -0.2]))):
         np.testing.assert_allclose(one.X @ B @ one.Z, A, atol=1e-12)
-    np.testing.assert_allclose(np.abs(motion.open.T), [[0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(motion.open_directions.T), [[0, 1, 0]], atol=1e-12)

@@ -78,7 +78,8 @@ def test_runs_end_at_gaps_and_need_photographs():
         assert one.start == own.min() and one.spacing > 0.09
         assert np.isclose(one.start + one.intervals * one.spacing, own.max())
         assert one.controls <= len(own) / 2 + 1e-9
-    assert [one.first for one in runs] == [0, *np.cumsum([one.controls for one in runs])[:2]]
+    controls = [one.controls for one in runs]
+    assert [one.first_control for one in runs] == [0, *np.cumsum(controls)[:2]]
     # photographs of two cameras at one time count once
     assert plan_runs(np.zeros(14, int), np.repeat(np.arange(7) / 30, 2), 0.1, 0.1)[0] == ()
 
@@ -125,7 +126,7 @@ def test_instants_are_in_their_intervals():
     clock = trajectory.clocks.value[trajectory.camera].T
     u = instant.place(tuple(clock))
     assert (u > -1e-6).all() and (u < 1 + 1e-6).all()
-    assert first.max() + 3 == trajectory.runs[-1].first + trajectory.runs[-1].controls - 1
+    assert first.max() + 3 == trajectory.runs[-1].first_control + trajectory.runs[-1].controls - 1
     later = trajectory.with_clocks(trajectory.clocks.value + [0.25, 0, 0])
     moved, instant = later.intervals(rows, line)
     assert (moved >= first).all() and (moved > first).any()

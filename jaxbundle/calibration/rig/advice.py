@@ -52,8 +52,8 @@ def _advise_undetermined(rig: "RigCalibration") -> Iterator[str]:
     for name, (sigma, direction) in undetermined_mountings(rig).items():
         yield (
             f"the position of {name!r} is not determined along {_direction(direction)}: σ "
-            f"{sigma:.3g} "
-            f"{rig.object_unit} is beyond the distance of the boards; {_remedy(rig, name)}"
+            f"{sigma:.3g} {rig.object_unit} is beyond the distance of the boards; "
+            f"{_remedy(rig, name)}"
         )
 
 

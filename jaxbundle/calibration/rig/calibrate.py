@@ -108,9 +108,11 @@ def calibrate_rig(  # noqa: PLR0913 - what a rig may be given by
     rig does not determine a mounting that nothing else does.
     """
     check_test(options.get("snooping", "pope"), options.get("significance", 0.001))
-    wanded = [] if wand is None else [name for name in wand.markers if name not in photographs]
-    _check(photographs, wanded)
-    known_of_mountings = known_mountings(mountings, bases, [*photographs, *wanded])
+    wand_cameras = (
+        [] if wand is None else [name for name in wand.markers if name not in photographs]
+    )
+    _check(photographs, wand_cameras)
+    known_of_mountings = known_mountings(mountings, bases, [*photographs, *wand_cameras])
     unknowns = _unknowns_of_clocks(synchronize, times, bool(options.get("board_free")))
     if bodies is not None:
         bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
@@ -217,7 +219,9 @@ def _adjust_together(
             "its own; give the σ of their coordinates instead (--board-sigma)"
         )
     rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
-    size = np.array([unit_size(get_model(one.model), one.pixel_size) for one in rig.cameras])
+    size = np.array(
+        [unit_size(get_model(camera.model), camera.pixel_size) for camera in rig.cameras]
+    )
     left_out, held_unknowns = [], {}
     if rig.trajectory is None:
         result = adjust_rig(rig, max_iterations)
@@ -226,33 +230,33 @@ def _adjust_together(
         left_out = without_run(rig)
     require_solved(result, connections.ties)
     # Each time from the start values: a wrong epoch may have led the adjustment far away.
-    while (bad := _contradictions(rig, result, size)) and snooping:
+    while (contradictions := _contradictions(rig, result, size)) and snooping:
         why = (
             "does not fit the mounting (RMS {:.1f} px): photographs not simultaneous?"
             if rig.trajectory is None
             else "does not fit the motion and the mounting (RMS {:.1f} px): is its time right?"
         )
-        left_out += [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
+        left_out += [(rig.epochs[e], why.format(rms)) for e, rms in contradictions.items()]
         result = require_solved(
-            leave_out(rig, result, np.isin(rig.epoch, list(bad)), max_iterations)
+            leave_out(rig, result, np.isin(rig.epoch, list(contradictions)), max_iterations)
         )
     if snooping:
         result = snoop_rig(result, snooping, significance, max_iterations)
     why = "kept, but does not fit the mounting (RMS {:.1f} px)"
-    tolerated = [(rig.epochs[e], why.format(rms)) for e, rms in bad.items()]
+    tolerated = [(rig.epochs[e], why.format(rms)) for e, rms in contradictions.items()]
     return RigCalibration(
         dict(calibrations), rig, result, left_out, tolerated, connections, held_unknowns
     )
 
 
-def _check(photographs: Any, other_cameras: Sequence[str]) -> None:
-    """Refuse photographs of one camera without `other_cameras`."""
+def _check(photographs: Any, wand_cameras: Sequence[str]) -> None:
+    """Refuse photographs of one camera without `wand_cameras`."""
     if not isinstance(photographs, Mapping):
         raise InputError(
             "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
             f"is {show(photographs)}"
         )
-    if len(photographs) < (1 if other_cameras else 2):
+    if len(photographs) < (1 if wand_cameras else 2):
         raise InputError("a rig has at least two cameras: give the photographs of each")
 
 
@@ -262,7 +266,7 @@ def require_solved(result: Result, ties: Sequence[MotionTie] = ()) -> Result:
     **Raises:** `NotSolvedError` for another one."""
     if not result.converged:
         names = result.undetermined
-        details = f"; not determined: {list_some(names, 8, str)}" if names else ""
+        undetermined = f"; not determined: {list_some(names, 8, str)}" if names else ""
         advice = (
             "what is given of the mountings hardly determines what the motion of the rig leaves "
             "open: give it with a smaller σ, or rotate the rig about a second axis"
@@ -271,7 +275,7 @@ def require_solved(result: Result, ties: Sequence[MotionTie] = ()) -> Result:
             "simultaneous"
         )
         raise NotSolvedError(
-            f"not solved: the rig did not converge ({result.termination}){details}; {advice}",
+            f"not solved: the rig did not converge ({result.termination}){undetermined}; {advice}",
             list(names),
         )
     return result

@@ -86,14 +86,14 @@ WAND_LENGTH = "wand length"
 class RigWand:
     """A wand as the last body of a rig, whose two points are its last.
 
-    **Fields:** `length` of it and `sigma`; `first`: the row of the pose of its first frame, all
-    later ones are its own; `across`: by frame an axis at right angles to the wand, which stops its
-    rotation about itself (z₀ of `wand_body`)."""
+    **Fields:** `length` of it and `sigma`; `first_row`: that of the pose of its first frame, all
+    later ones are its own; `perpendicular_axes`: by frame an axis at right angles to the wand,
+    which stops its rotation about itself (z₀ of `wand_body`)."""
 
     length: float
     sigma: float
-    first: int
-    across: Float[np.ndarray, "frames 3"]
+    first_row: int
+    perpendicular_axes: Float[np.ndarray, "frames 3"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,10 +242,10 @@ def _wand(rig: Rig, wand: RigWand) -> list[ObservationSet]:
     """The known length of a wand, and its rolls."""
     first_end, second_end = np.array([[len(rig.points) - 2], [len(rig.points) - 1]])
     length, sigma = np.array([wand.length]), np.array([wand.sigma])
-    frames = wand.first + np.arange(len(wand.across))
+    frames = wand.first_row + np.arange(len(wand.perpendicular_axes))
     return [
         DISTANCES((first_end, second_end), length, sigma=sigma, name=WAND_LENGTH),
-        ROLLS((frames,), wand.across, sigma=np.ones(len(frames))),
+        ROLLS((frames,), wand.perpendicular_axes, sigma=np.ones(len(frames))),
     ]
 
 
@@ -286,8 +286,8 @@ def _timed_image_points(rig: Rig, trajectory: TargetMotion) -> list[ObservationS
     observations = []
     for table, rows in rig.sets:
         k, epoch = rig.camera[rows], rig.epoch[rows]
-        first_pose, instant = trajectory.intervals(epoch, line[rows])
-        controls = (first_pose + j for j in range(CONTROLS))
+        first_control, instant = trajectory.intervals(epoch, line[rows])
+        controls = (first_control + j for j in range(CONTROLS))
         touched_rows = (*controls, k, k, np.searchsorted(table.cameras, k), rig.point[rows])
         if board:
             touched_rows = rig.board_of_points[rig.point[rows]], *touched_rows

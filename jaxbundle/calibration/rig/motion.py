@@ -54,26 +54,26 @@ ROUNDING = 1e-9
 class Motion(NamedTuple):
     """How the motion of a rig ties two groups of cameras.
 
-    `X`, `Z`: see above, with the smallest translations where they are open; `open`: the directions
-    in the frame of the first cameras along which the mounting is open, [3, 0], [3, 1] (the axis of
-    all rotations) or [3, 3] (no rotations); `turn`: from that frame to that of the first boards,
-    for the shifts along these.
+    `X`, `Z`: see above, with the smallest translations where they are open;
+    `open_directions`: those in the frame of the first cameras along which the mounting is open,
+    [3, 0], [3, 1] (the axis of all rotations) or [3, 3] (no rotations); `turn`: the rotation from
+    that frame to that of the first boards, for the shifts along these.
     """
 
     X: Float[np.ndarray, "4 4"]
     Z: Float[np.ndarray, "4 4"]
-    open: Float[np.ndarray, "3 directions"]
+    open_directions: Float[np.ndarray, "3 directions"]
     turn: Float[np.ndarray, "3 3"]
 
     @property
     def determined(self) -> bool:
         """Whether the whole mounting follows."""
-        return self.open.shape[1] == 0
+        return self.open_directions.shape[1] == 0
 
     def shifted(self, shift: Float[np.ndarray, "3"]) -> "Motion":
         """The same with another translation of X, of which only the open part counts: it moves the
         second boards with the second cameras."""
-        open_part = self.open @ self.open.T @ shift
+        open_part = self.open_directions @ self.open_directions.T @ shift
         X, Z = self.X.copy(), self.Z.copy()
         X[:3, 3] += open_part
         Z[:3, 3] -= Z[:3, :3] @ self.turn @ open_part  # u loses what t_X gains
@@ -88,9 +88,9 @@ def tie_by_motion(A: Float[np.ndarray, "n 4 4"], B: Float[np.ndarray, "n 4 4"]) 
     n, R = len(A), A[:, :3, :3]
     weight, size = np.ones(n), max(float(np.median(np.linalg.norm(A[:, :3, 3], axis=1))), 1e-300)
     for _ in range(REWEIGHTED):
-        by_number = {number: _solve(A, B, weight, number) for number in (0, 1, 3)}
+        solutions = {number: _solve(A, B, weight, number) for number in (0, 1, 3)}
         turns = {
-            k: _log(R, X[:3, :3] @ B[:, :3, :3] @ Z[:3, :3]) for k, (X, Z) in by_number.items()
+            k: _log(R, X[:3, :3] @ B[:, :3, :3] @ Z[:3, :3]) for k, (X, Z) in solutions.items()
         }
         # The median of the length of three errors of σ is 1.54 σ (χ with three degrees of freedom);
         # 6 unknowns are subtracted from the 3n angles. Of rotations about one axis the formulas of
@@ -98,23 +98,19 @@ def tie_by_motion(A: Float[np.ndarray, "n 4 4"], B: Float[np.ndarray, "n 4 4"]) 
         lengths = min(float(np.median(np.linalg.norm(turn, axis=1))) for turn in turns.values())
         noise = max(lengths / 1.54 * np.sqrt(3 * n / (3 * n - 6)), ROUNDING)
         extents, V = _rotations(R, weight)
-        number_of_zero = int((extents <= SIGNIFICANT * noise).sum())
-        X, Z = by_number[number_of_zero if number_of_zero < 2 else 3]
+        open_axes = int((extents <= SIGNIFICANT * noise).sum())
+        X, Z = solutions[open_axes if open_axes < 2 else 3]
         misclosure = A - X @ B @ Z
-        size_of_misclosure = np.linalg.norm(misclosure[:, :3, :3], axis=(1, 2))
-        size_of_misclosure = (
-            size_of_misclosure + np.linalg.norm(misclosure[:, :3, 3], axis=1) / size
-        )
+        distance = np.linalg.norm(misclosure[:, :3, :3], axis=(1, 2))
+        distance = distance + np.linalg.norm(misclosure[:, :3, 3], axis=1) / size
         # The sum of distances instead of squares: a wrong epoch pulls no harder than a right one.
-        weight = 1 / np.maximum(
-            size_of_misclosure, max(float(np.median(size_of_misclosure)), ROUNDING)
-        )
+        weight = 1 / np.maximum(distance, max(float(np.median(distance)), ROUNDING))
         weight = weight / weight.mean()
     mean = np.einsum("e,eij->ij", weight / weight.sum(), R)
     turn = nearest_rotation(mean).T
-    if number_of_zero == 0:
+    if open_axes == 0:
         return Motion(X, Z, np.zeros((3, 0)), turn)
-    if number_of_zero == 1:
+    if open_axes == 1:
         axis = mean @ V[2]
         return Motion(X, Z, (axis / np.linalg.norm(axis))[:, None], turn)
     return Motion(X, Z, np.eye(3), turn)

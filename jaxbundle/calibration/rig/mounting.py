@@ -73,20 +73,23 @@ def table_of_mountings(mountings: Mapping[str, Mounting]) -> dict[str, np.ndarra
 
 @partial(compile_once, static=0)
 def _to_angles(
-    placed: bool, pose: PoseValue, own_centroid: Float[AnyArray, "3"], frame: Float[AnyArray, "3"]
+    placed: bool,
+    pose: PoseValue,
+    own_centroid: Float[AnyArray, "3"],
+    frame_centroid: Float[AnyArray, "3"],
 ) -> tuple[Array, Array, Array, Array]:
     """Base, R, ω, φ, κ, and derivatives of base and angles by (δb, δθ).
 
     Of a camera the pose is its mounting: base and R. A board is `placed` by its pose, from its
-    frame to that of its body, relative to the centroids of both, `own_centroid` and `frame`: the
-    inverse says where it is."""
+    frame to that of its body, relative to the centroids of both, `own_centroid` and
+    `frame_centroid`: the inverse says where it is."""
     block = Pose().prepare(pose)
 
     def place(block: Any) -> tuple[Array, Array]:
         R = block.rotation.matrix()
         if not placed:
             return jnp.stack(block.centre), R
-        return frame - R @ (own_centroid + jnp.stack(block.centre)), R.T
+        return frame_centroid - R @ (own_centroid + jnp.stack(block.centre)), R.T
 
     base, R = place(block)
     # Angles near the given ones, so that κ does not jump by a full turn in the derivatives.
@@ -101,21 +104,23 @@ def _to_angles(
 
 def mounting_of(pose: PoseValue, C: Float[np.ndarray, "6 6"]) -> Mounting:
     """A mounting by its pose and the covariance of (δb, δθ)."""
-    return _with_covariance(_to_angles(False, pose, np.zeros(3), np.zeros(3)), C)
+    return _mounting_with_covariance(_to_angles(False, pose, np.zeros(3), np.zeros(3)), C)
 
 
 def placement_of(
     pose: PoseValue,
     C: Float[np.ndarray, "6 6"],
     own_centroid: Float[np.ndarray, "3"],
-    frame: Float[np.ndarray, "3"],
+    frame_centroid: Float[np.ndarray, "3"],
 ) -> Mounting:
     """The place of a board by its pose on its body, with the centroids of the board and of the
     first board of the body, and the covariance of the pose."""
-    return _with_covariance(_to_angles(True, pose, own_centroid, frame), C)
+    return _mounting_with_covariance(_to_angles(True, pose, own_centroid, frame_centroid), C)
 
 
-def _with_covariance(values_and_derivatives: tuple, C: Float[np.ndarray, "6 6"]) -> Mounting:
+def _mounting_with_covariance(
+    values_and_derivatives: tuple, C: Float[np.ndarray, "6 6"]
+) -> Mounting:
     base, R, angles, J = map(np.asarray, values_and_derivatives)
     J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
     # σ of |b|: the variance along b

@@ -136,12 +136,12 @@ def next_view(
         visible.append(is_visible)
     J, J_pose = (np.concatenate(parts, axis=1) for parts in zip(*rows))
     is_visible = np.array(visible)
-    columns = starts[names.index(camera)] + np.arange(3)
-    sigma_before = float(np.sqrt(np.linalg.eigvalsh(C[np.ix_(columns, columns)])[-1]))
+    base_columns = starts[names.index(camera)] + np.arange(3)
+    sigma_before = float(np.sqrt(np.linalg.eigvalsh(C[np.ix_(base_columns, base_columns)])[-1]))
     best = None
     # Seen by this camera alone, the unknown pose takes all that it says on the mounting.
     for n in np.flatnonzero(is_visible[names.index(camera)] & (is_visible.sum(0) > 1)):
-        sigma_after = _sigma_with(C, J[n], J_pose[n], columns)
+        sigma_after = _sigma_with(C, J[n], J_pose[n], base_columns)
         if best is None or sigma_after < best.after:
             pixel, distance, tilt, roll, pose = facts[n]
             cameras_that_see = tuple(name for name, sees in zip(names, is_visible[:, n]) if sees)
@@ -168,7 +168,7 @@ def _sigma_with(
     C: Float[np.ndarray, "k k"],
     J: Float[np.ndarray, "n k"],
     J_pose: Float[np.ndarray, "n 6"],
-    columns: np.ndarray,
+    base_columns: np.ndarray,
 ) -> float:
     """σ of the base in its weakest direction with one more photograph of all cameras."""
     # By factors of QR: J_pᵀ·J_p would square the condition of a small board far away.
@@ -176,8 +176,10 @@ def _sigma_with(
     A = J - Q @ (Q.T @ J)
     AC = A @ C
     S = np.eye(len(A)) + AC @ A.T
-    new = C[np.ix_(columns, columns)] - AC[:, columns].T @ np.linalg.solve(S, AC[:, columns])
-    return float(np.sqrt(max(np.linalg.eigvalsh(new)[-1], 0.0)))
+    updated = C[np.ix_(base_columns, base_columns)] - AC[:, base_columns].T @ np.linalg.solve(
+        S, AC[:, base_columns]
+    )
+    return float(np.sqrt(max(np.linalg.eigvalsh(updated)[-1], 0.0)))
 
 
 def _whitened(

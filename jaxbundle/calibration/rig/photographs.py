@@ -21,7 +21,7 @@ RigPhotographs = (
 
 
 def views_of_camera(
-    given: Mapping[str, Any],
+    sources: Mapping[str, Any],
     board: Board | Mapping[str, Board] | str | Path | None,
     seen_by: Mapping[str, Sequence[str]] | None = None,
     progress: Progress | None = None,
@@ -34,16 +34,18 @@ def views_of_camera(
     boards, bodies, cameras_of = _boards_of(board, seen_by)
     for name, cameras in cameras_of.items():
         for camera in cameras:
-            if camera not in given:
+            if camera not in sources:
                 raise InputError(
                     f"board {name!r} is to be seen by a camera {camera!r}, which is not given"
-                    f"{did_you_mean(camera, given)}"
+                    f"{did_you_mean(camera, sources)}"
                 )
-    _refuse_same_files(given)
+    _refuse_same_files(sources)
     views = {}
-    for name, source in given.items():
+    for name, source in sources.items():
         boards_of_camera = {
-            b: known_board for b, known_board in boards.items() if name in cameras_of.get(b, given)
+            b: known_board
+            for b, known_board in boards.items()
+            if name in cameras_of.get(b, sources)
         }
         tell = (
             None
@@ -57,20 +59,20 @@ def views_of_camera(
     return views, bodies or None
 
 
-def require_lists(name: str, given: Any, example: str) -> dict[str, list[str]]:
+def require_lists(name: str, argument: Any, example: str) -> dict[str, list[str]]:
     """Lists of names by name; none if nothing is given.
 
     **Raises:** `InputError` about another argument."""
-    lists = {} if given is None else given
-    good = isinstance(lists, Mapping) and all(
+    lists = {} if argument is None else argument
+    is_valid = isinstance(lists, Mapping) and all(
         isinstance(names, Sequence)
         and not isinstance(names, str)
         and all(isinstance(entry, str) for entry in (key, *names))
         for key, names in lists.items()
     )
-    if not good:
+    if not is_valid:
         raise InputError(
-            f"{name} must be lists of names by name, such as {example}, but is {show(given)}"
+            f"{name} must be lists of names by name, such as {example}, but is {show(argument)}"
         )
     return {key: list(names) for key, names in lists.items()}
 
@@ -130,7 +132,7 @@ def _views(
             for name, other_board in boards.items()
             if name not in boards_of_camera
         }
-        if (board_seen := _sees(files, other_boards)) is None:
+        if (board_seen := _board_in_photographs(files, other_boards)) is None:
             raise
         raise InputError(
             f"{error}. But they show board {board_seen!r}, which other cameras are to see: are the "
@@ -138,7 +140,9 @@ def _views(
         ) from None
 
 
-def _sees(files: Sequence[str | Path], other_boards: Mapping[str, Board]) -> str | None:
+def _board_in_photographs(
+    files: Sequence[str | Path], other_boards: Mapping[str, Board]
+) -> str | None:
     """A board that the photographs show, of those that are not to be there."""
     for name, board in other_boards.items():
         try:
@@ -164,21 +168,16 @@ def _require_views(views_by_board: Mapping[Any, Any]) -> Mapping[str, BoardViews
 def _refuse_same_files(sources: Mapping[str, Any]) -> None:
     """Refuse a folder that is given for two cameras."""
     owner: dict[Path, str] = {}
-    for name, photographs_of_camera in sources.items():
-        if isinstance(photographs_of_camera, BoardViews | Calibration | Mapping):
+    for name, source in sources.items():
+        if isinstance(source, BoardViews | Calibration | Mapping):
             continue
-        files = (
-            [photographs_of_camera]
-            if isinstance(photographs_of_camera, str | Path)
-            else photographs_of_camera
-        )
+        files = [source] if isinstance(source, str | Path) else source
         if not isinstance(files, Sequence):
             continue
         for path in photographs(files):
-            earlier_name = owner.setdefault(path.resolve(), name)
-            if earlier_name != name:
+            first_owner = owner.setdefault(path.resolve(), name)
+            if first_owner != name:
                 raise InputError(
-                    f"{path} is given for camera {earlier_name!r} and for camera {name!r}; "
-                    "expected "
+                    f"{path} is given for camera {first_owner!r} and for camera {name!r}; expected "
                     "photographs of its own for each camera: one folder a camera"
                 )

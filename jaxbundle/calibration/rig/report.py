@@ -94,34 +94,33 @@ def _wand_facts(rig: "RigCalibration", unit: str) -> list[tuple[str, str]]:
     if rig.rig.wand is None or rig.wand_length is None:
         return []
     value, sigma = estimate(*rig.wand_length)
-    is_removed = any(item.kind == "distance" for item in rig.removed)
+    is_removed = any(blunder.kind == "distance" for blunder in rig.removed)
     given_length = (
         f"{rig.rig.wand.length:g} was given" + ", which contradicts the boards" * is_removed
     )
-    frames = count(len(rig.rig.wand.across), "frame")
-    of_boards = rig.rig.epoch < rig.rig.wand.first
+    frames = count(len(rig.rig.wand.perpendicular_axes), "frame")
+    of_boards = rig.rig.epoch < rig.rig.wand.first_row
     views = np.unique(np.stack([rig.rig.epoch, rig.rig.camera], 1)[of_boards], axis=0)
-    are_shared = np.bincount(views[:, 0]).max(initial=0) > 1
-    remark = "" if are_shared else "; no board is seen by two cameras at the same time"
+    is_simultaneous = np.bincount(views[:, 0]).max(initial=0) > 1
+    remark = "" if is_simultaneous else "; no board is seen by two cameras at the same time"
     return [("Wand", f"{value} ± {sigma} {unit}, {given_length}; {frames}{remark}")]
 
 
 def _tied_facts(rig: "RigCalibration") -> list[tuple[str, str]]:
     """Which boards are fixed to each other, and which cameras only the motion of the rig ties."""
     words = lambda names: ", ".join(map(clean, names))
-    tied = [("Fixed to each other", words(body)) for body in rig.bodies if len(body) > 1]
+    rows = [("Fixed to each other", words(body)) for body in rig.bodies if len(body) > 1]
     for tie in rig.ties:
         (cameras_a, cameras_b), (boards_a, boards_b) = tie.cameras, tie.boards
         open_directions = f"; {count(tie.open, 'direction')} left open" if tie.open else ""
-        tied.append(
+        rows.append(
             (
                 "Tied by motion",
                 f"{words(cameras_a)} ({words(boards_a)}) and {words(cameras_b)} "
-                f"({words(boards_b)}), "
-                f"{tie.epochs} epochs{open_directions}",
+                f"({words(boards_b)}), {tie.epochs} epochs{open_directions}",
             )
         )
-    return tied
+    return rows
 
 
 def mounting_titles(rig: "RigCalibration") -> dict[str, "Mounting"]:

@@ -95,8 +95,8 @@ class RigCalibration(TableMethods):
 
     @property
     def epochs(self) -> tuple[str, ...]:
-        stay = zip(self.rig.epoch_of_rows, self._stays)
-        return tuple(dict.fromkeys(epoch for epoch, stays in stay if stays))
+        epochs = zip(self.rig.epoch_of_rows, self._stays)
+        return tuple(dict.fromkeys(epoch for epoch, stays in epochs if stays))
 
     @property
     def _stays(self) -> list[bool]:
@@ -196,22 +196,27 @@ class RigCalibration(TableMethods):
         """Observations removed by data snooping."""
         rig, removals = self.rig, []
         rows_of = {table.image_set: rows for table, rows in rig.sets}
-        for item in self.result.removed:
-            if item.set == "control":
-                axis = not_none(item.residual)  # coordinates are tested individually
-                name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
-                removals.append(Removed("control", 3 * item.row + axis, name, item.test))
+        for blunder in self.result.removed:
+            if blunder.set == "control":
+                axis = not_none(blunder.residual)  # coordinates are tested individually
+                name = f"{'XYZ'[axis]} of point {rig.ids[blunder.row]}"
+                removals.append(Removed("control", 3 * blunder.row + axis, name, blunder.test))
                 continue
-            if item.set == WAND_LENGTH:
-                removals.append(Removed("distance", item.row, "the length of the wand", item.test))
+            if blunder.set == WAND_LENGTH:
+                removals.append(
+                    Removed("distance", blunder.row, "the length of the wand", blunder.test)
+                )
                 continue
-            rows = rows_of[item.set][list(item.rows)]
-            removed_rows = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
+            rows = rows_of[blunder.set][list(blunder.rows)]
+            points_and_views = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
             names = [
-                f"point {rig.ids[p]} in image {self._photograph(k, e)}" for p, k, e in removed_rows
+                f"point {rig.ids[p]} in image {self._photograph(k, e)}"
+                for p, k, e in points_and_views
             ]
             other_rows = tuple(rows[1:].tolist())
-            removals.append(Removed("image", int(rows[0]), either_of(names), item.test, other_rows))
+            removals.append(
+                Removed("image", int(rows[0]), either_of(names), blunder.test, other_rows)
+            )
         return removals
 
     @property
@@ -286,7 +291,7 @@ class RigCalibration(TableMethods):
         """Errors that image points share, if they were looked for in the cameras by themselves;
         None where they cannot be found."""
         settings = [calibration.adjustment.correlations for calibration in self.cameras.values()]
-        if not self.converged or any(calibration is None for calibration in settings):
+        if not self.converged or any(settings_of_camera is None for settings_of_camera in settings):
             return None
         return rig_errors(self.rig, self.result.solution, not_none(settings[0]))
 

@@ -98,9 +98,9 @@ def collect_boards(
         if isinstance(calibration.views.board, Board)
         and calibration.views.board not in boards.values()
     ]
-    different = list(dict.fromkeys(unnamed_boards))
-    for number, board in enumerate(different, 1):
-        boards["board" if len(different) == 1 and not boards else f"board {number}"] = board
+    distinct_boards = list(dict.fromkeys(unnamed_boards))
+    for number, board in enumerate(distinct_boards, 1):
+        boards["board" if len(distinct_boards) == 1 and not boards else f"board {number}"] = board
     body = {name: "all boards" if fixed else name for name in boards}
     for name, members in (bodies or {}).items():
         if name in boards and name not in members:
@@ -159,16 +159,16 @@ def start_rig(
     calibrations: Mapping[str, Calibration],
     bodies: Mapping[str, Sequence[str]] | None = None,
     fixed: bool = False,
-    known: KnownMountings = NOTHING_KNOWN,
+    known_mountings: KnownMountings = NOTHING_KNOWN,
     nearly: Keys | None = None,
     wand: "WandBody | None" = None,
 ) -> tuple[Rig, Connections]:
     """The rig with start values, and the image points that the calibration of each camera kept.
 
     **Arguments:** `bodies`: by name, boards that are fixed to each other; `fixed`: all are;
-    `known`: what is given of the mountings; `nearly`: the epochs of photographs that are nearly
-    simultaneous. Start values are by these, and then every photograph is an epoch of its own.
-    `wand`: ties its cameras; its frames are not among the epochs (`wand_body.add_wand`), its
+    `known_mountings`: what is given of the mountings; `nearly`: the epochs of photographs that are
+    nearly simultaneous. Start values are by these, and then every photograph is an epoch of its
+    own. `wand`: ties its cameras; its frames are not among the epochs (`wand_body.add_wand`), its
     cameras that see no board come last.
 
     **Raises:** `InputError`, `NotSolvedError` if the cameras do not hang together
@@ -183,7 +183,7 @@ def start_rig(
     numbers = [body.index(boards.body[name]) for name in names]
     wand_cameras = {} if wand is None else wand.cameras
     of_rig = [*calibrations, *wand_cameras]
-    given_positions = known.positions(of_rig)
+    given_positions = known_mountings.positions(of_rig)
     if wand is None:
         connections = connect(of_rig, names, numbers, views, given_positions)
     else:
@@ -215,7 +215,7 @@ def start_rig(
             for name, calibration in calibrations.items()
         )
         + tuple(wand_cameras.values()),
-        _hold(pose_values(connections.mountings), of_rig, known),
+        _hold(pose_values(connections.mountings), of_rig, known_mountings),
         tuple(labels),
         pose_values(poses),
         boards.ids,
@@ -228,12 +228,12 @@ def start_rig(
         times=tuple(epochs[e] for e, _ in rows),
         boards=tuple(names),
         board=np.repeat(np.arange(len(names)), [len(b.ids) for b in boards.boards.values()]),
-        centroids=np.array([calibration.points.mean(0) for calibration in boards.boards.values()]),
+        centroids=np.array([board.points.mean(0) for board in boards.boards.values()]),
         place=None
         if len(connections.bodies) == len(connections.places)
         else pose_values(connections.places[: len(names)]),
         body=tuple(reference),
-        known=known,
+        known=known_mountings,
     )
     return rig, connections
 
@@ -279,7 +279,7 @@ def board_views(
 ) -> list[BoardView]:
     """The poses of all views, boards relative to their centroids."""
     names, views_found = list(boards.boards), []
-    number = {key: e for e, key in enumerate(epochs)}
+    row_of_epoch = {key: e for e, key in enumerate(epochs)}
     for k, camera in enumerate(cameras):
         calibration = camera.calibration
         points_seen = calibration.views.visible.sum(1)
@@ -287,7 +287,7 @@ def board_views(
             M, X0 = calibration.rotation[i], calibration.position[i]
             pose = transformation(M, M @ (boards.boards[board].points.mean(0) - X0))
             views_found.append(
-                BoardView(k, names.index(board), number[key], pose, int(points_seen[i]))
+                BoardView(k, names.index(board), row_of_epoch[key], pose, int(points_seen[i]))
             )
     return views_found
 
@@ -304,12 +304,12 @@ def _hold(
 ) -> PoseValue:
     """Mountings with those parts that are held as they are given."""
     position, rotation = np.array(mounting.position), np.array(mounting.rotation)
-    for name, mounting_given in known_mountings.mountings.items():
+    for name, known_mounting in known_mountings.mountings.items():
         k = cameras.index(name)
-        if mounting_given.is_held[0]:
-            position[k] = mounting_given.position
-        if mounting_given.is_held[1]:
-            M = matrix_from_omega_phi_kappa(not_none(mounting_given.angles))
+        if known_mounting.is_held[0]:
+            position[k] = known_mounting.position
+        if known_mounting.is_held[1]:
+            M = matrix_from_omega_phi_kappa(not_none(known_mounting.angles))
             rotation[k] = quaternion_from_matrix(M)
     return PoseValue(position, rotation)
 
@@ -331,18 +331,18 @@ def _rays(
     Points that it removed as gross stay out: data snooping of the rig finds only what the mounting
     reveals."""
     network, views = camera.calibration.adjustment.problem.network, camera.calibration.views
-    rays, used = network.observations, quality.used_rays(camera.calibration.adjustment.problem)
+    rays, is_used = network.observations, quality.used_rays(camera.calibration.adjustment.problem)
     names = list(boards.boards)
     # Of a video every photograph is an epoch: a search of the list for each takes the square.
-    number = {key: e for e, key in enumerate(epochs)}
+    row_of_epoch = {key: e for e, key in enumerate(epochs)}
     row_of_image = {
-        view: row_of[number[key], reference[names.index(board)]]
+        view: row_of[row_of_epoch[key], reference[names.index(board)]]
         for view, board, key in zip(views.names, camera.board, camera.epoch)
     }
-    point = dict(zip(views.board.ids, camera.rows))
+    row_of_point = dict(zip(views.board.ids, camera.rows))
     return (
-        np.array([row_of_image[id] for id in network.images.id])[rays.image[used]],
-        np.array([point[id] for id in network.points.id])[rays.point[used]],
-        rays.xy[used],
-        rays.sigma[used],
+        np.array([row_of_image[id] for id in network.images.id])[rays.image[is_used]],
+        np.array([row_of_point[id] for id in network.points.id])[rays.point[is_used]],
+        rays.xy[is_used],
+        rays.sigma[is_used],
     )

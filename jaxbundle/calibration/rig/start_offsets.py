@@ -67,21 +67,21 @@ def speeds_of_cameras(
         views_of_track = sorted(views_of_track, key=lambda view: time[view.epoch])
         t = time[[view.epoch for view in views_of_track]]
         T = np.array([view.pose for view in views_of_track])
-        earlier, later = (
+        begin, end = (
             np.arange(len(views_of_track) - 2 * h),
             np.arange(2 * h, len(views_of_track)),
         )
-        span = t[later] - t[earlier]
+        span = t[end] - t[begin]
         # Half a frame of tolerance: none is missing between.
-        close = (span > 0) & (span < (2 * h + 0.5) * frame[camera])
-        earlier, later, span = earlier[close], later[close], span[close]
+        is_complete = (span > 0) & (span < (2 * h + 0.5) * frame[camera])
+        begin, end, span = begin[is_complete], end[is_complete], span[is_complete]
         if not len(span):
             continue
-        middle = (t[earlier] + t[later]) / 2
-        trace = np.einsum("nij,nij->n", T[earlier, :3, :3], T[later, :3, :3])
-        turned = np.arccos(np.clip((trace - 1) / 2, -1, 1)) / span
-        speed = np.linalg.norm(T[later, :3, 3] - T[earlier, :3, 3], axis=1) / span
-        speeds[camera]["turn", body[board]].append((middle, turned))
+        middle = (t[begin] + t[end]) / 2
+        trace = np.einsum("nij,nij->n", T[begin, :3, :3], T[end, :3, :3])
+        angular_velocity = np.arccos(np.clip((trace - 1) / 2, -1, 1)) / span
+        speed = np.linalg.norm(T[end, :3, 3] - T[begin, :3, 3], axis=1) / span
+        speeds[camera]["turn", body[board]].append((middle, angular_velocity))
         speeds[camera]["move", board].append((middle, speed))
     gap = (2 * h + 0.5) * frame
     return [
@@ -113,8 +113,8 @@ def start_offsets(
     of_first = np.full(number, np.nan)
     of_first[0] = 0.0
     while True:
-        is_done = np.isfinite(of_first)
-        open_pairs = np.where(is_done[:, None] & ~is_done[None], score, -np.inf)
+        is_joined = np.isfinite(of_first)
+        open_pairs = np.where(is_joined[:, None] & ~is_joined[None], score, -np.inf)
         i, j = np.unravel_index(np.argmax(open_pairs), score.shape)
         if not np.isfinite(open_pairs[i, j]):
             return of_first
@@ -174,9 +174,9 @@ def _scores(
     independent = 1 / (2 * settings.half_window)
     for k, offset in enumerate(offsets):
         t = a.time - offset
-        next_row: Int[np.ndarray, " n"] = np.searchsorted(b.time, t).clip(1, len(b.time) - 1)
-        is_inside = (t >= b.time[next_row - 1]) & (t <= b.time[next_row])
-        is_inside &= b.time[next_row] - b.time[next_row - 1] < b.gap
+        right: Int[np.ndarray, " n"] = np.searchsorted(b.time, t).clip(1, len(b.time) - 1)
+        is_inside = (t >= b.time[right - 1]) & (t <= b.time[right])
+        is_inside &= b.time[right] - b.time[right - 1] < b.gap
         n = int(is_inside.sum())
         if n < max(min_number, 1 / independent):
             continue

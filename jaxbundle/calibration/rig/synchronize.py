@@ -127,7 +127,9 @@ def start_unsynchronized(
         _knots(views, [*centres.values()], time, float(np.median(frame))) / settings.undersmoothing,
         settings.least_frames * float(np.median(frame)),
     )
-    sigma0 = float(np.median([board.adjustment.sigma0 for board in calibrations.values()]))
+    sigma0 = float(
+        np.median([calibration.adjustment.sigma0 for calibration in calibrations.values()])
+    )
     empty = TargetMotion(
         clocks,
         camera,
@@ -363,15 +365,17 @@ def _adjust_until_assigned(
         result = adjust_rig(rig, max_iterations)
         trajectory = not_none(rig.trajectory)
         values = result.minimum.values
-        new = trajectory.with_clocks(np.asarray(values[CLOCK]))
-        common = [motion.clocks.common(motion.camera, motion.time) for motion in (new, trajectory)]
+        adjusted = trajectory.with_clocks(np.asarray(values[CLOCK]))
+        common = [
+            motion.clocks.common(motion.camera, motion.time) for motion in (adjusted, trajectory)
+        ]
         spacing = min(run.spacing for run in trajectory.runs)
         if np.abs(common[0] - common[1]).max() < settings.max_move * spacing:
             break
         # Control poses belong to the knots they were found with: the last rig keeps these.
         if rounds_left == 0 or not np.isfinite(common[0]).all():
             break
-        rig = _planned_again(dataclasses.replace(rig, pose=rig.poses(values)), new)
+        rig = _planned_again(dataclasses.replace(rig, pose=rig.poses(values)), adjusted)
     return rig, result
 
 
@@ -386,7 +390,7 @@ def _undetermined(
 ) -> dict[str, dict[str, str]]:
     """By camera and unknown of its clock, why the motion does not determine it; `variance` of unit
     weight."""
-    trajectory, held_unknowns = not_none(rig.trajectory), {}
+    trajectory, reasons = not_none(rig.trajectory), {}
     clocks = trajectory.clocks
     for k, camera in enumerate(rig.cameras):
         is_of_camera = trajectory.camera == k
@@ -403,16 +407,16 @@ def _undetermined(
                 continue
             # σ with the mounting held, C_jj − cᵀ·M⁻¹·c: if that is small, the two are exchangeable
             M, c = C[3:, 3:], C[3:, j]
-            effect_of_sigma = np.sqrt(max(C[j, j] - c @ np.linalg.pinv(M) @ c, 0.0)) * effect[j]
+            conditional_effect = np.sqrt(max(C[j, j] - c @ np.linalg.pinv(M) @ c, 0.0)) * effect[j]
             why = (
                 "the target moves evenly while it is seen: another mounting does the same"
-                if k and 3 * effect_of_sigma < settings.min_frames_known * frame
+                if k and 3 * conditional_effect < settings.min_frames_known * frame
                 else "the target hardly moves while this camera and others see it"
             )
-            held_unknowns.setdefault(camera.id, {})[name] = (
+            reasons.setdefault(camera.id, {})[name] = (
                 f"not determined (σ of times {sigma[j]:.2g} s, a frame is {frame:.2g} s): {why}"
             )
-    return held_unknowns
+    return reasons
 
 
 def _clock_and_mounting(solution: Solution, k: int) -> Float[np.ndarray, "9 9"]:

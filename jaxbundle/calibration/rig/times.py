@@ -43,13 +43,13 @@ def times_of_photographs(
     times_found = {}
     for name, calibration in calibrations.items():
         times_of_camera = times[name] if isinstance(times, Mapping) else times
-        times_found[name] = _of_camera(
+        times_found[name] = _times_of_camera(
             name, list(dict.fromkeys(calibration.views.photographs)), times_of_camera
         )
     return times_found
 
 
-def _of_camera(camera: str, photographs: list[str], times: Any) -> dict[str, float]:
+def _times_of_camera(camera: str, photographs: list[str], times: Any) -> dict[str, float]:
     if isinstance(times, Mapping):
         seconds_of = {}
         for photograph in photographs:
@@ -61,8 +61,8 @@ def _of_camera(camera: str, photographs: list[str], times: Any) -> dict[str, flo
             seconds_of[photograph] = _seconds(camera, key, times[key])
     else:
         # True is an int of Python, and 1 frame per second would be a surprise
-        good = isinstance(times, int | float | np.number) and not isinstance(times, bool)
-        if not (good and 0 < times < np.inf):
+        is_rate = isinstance(times, int | float | np.number) and not isinstance(times, bool)
+        if not (is_rate and 0 < times < np.inf):
             raise InputError(f"times of camera {camera!r}: got {show(times)}; {HOW}")
         seconds_of = {name: _number(camera, name) / float(times) for name in photographs}
     # Two poses of one target at one instant contradict each other: IMG_7 beside copies of it, or
@@ -72,9 +72,8 @@ def _of_camera(camera: str, photographs: list[str], times: Any) -> dict[str, flo
         repeated = float(seconds[count > 1][0])
         names = " and ".join([name for name, t in seconds_of.items() if t == repeated][:2])
         raise InputError(
-            f"times of camera {camera!r}: {names} both have {repeated:g} s; expected a time of "
-            "its own "
-            "for each photograph"
+            f"times of camera {camera!r}: {names} both have {repeated:g} s; expected a time of its "
+            "own for each photograph"
         )
     return seconds_of
 

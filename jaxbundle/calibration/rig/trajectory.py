@@ -53,10 +53,10 @@ class Clocks:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A body in one run of photographs: `first` of its control poses; `start` and `spacing` of its
-    knots, seconds; number of `intervals`."""
+    """A body in one run of photographs: `first_control`: the row of the first of its control poses;
+    `start` and `spacing` of its knots, seconds; number of `intervals`."""
 
-    first: int
+    first_control: int
     start: float
     spacing: float
     intervals: int
@@ -98,15 +98,15 @@ class TargetMotion:
         """The first control pose, and the instant, of observations in photographs; of those
         without a run those of the first run, for observations without weight."""
         number, camera, time = np.maximum(self.run[row], 0), self.camera[row], self.time[row]
-        fields = [(r.first, r.start, r.spacing, r.intervals) for r in self.runs]
-        first_pose, start, spacing, size = np.array(fields).T[:, number]
+        fields = [(r.first_control, r.start, r.spacing, r.intervals) for r in self.runs]
+        first_control, start, spacing, size = np.array(fields).T[:, number]
         common = self.clocks.common(camera, time, line)
         # Before the first knot and behind the last one the cubic of the outer interval goes on.
         k = np.clip(np.floor((common - start) / spacing), 0, size - 1)
         # By its own clock: offset, rate and read-out are added where they are unknowns.
         since = time - (start + k * spacing)
         instant = Instant(since, time - self.clocks.middle[camera], line, 1 / spacing)
-        return (first_pose + k).astype(int), instant
+        return (first_control + k).astype(int), instant
 
     def with_clocks(self, value: Float[np.ndarray, "cameras 3"]) -> "TargetMotion":
         """The same with other start values of the clocks."""
@@ -114,15 +114,15 @@ class TargetMotion:
 
     def view_poses(self, controls: PoseValue, clocks: Float[np.ndarray, "cameras 3"]) -> PoseValue:
         """The pose of the reference camera relative to the body of every row, at its time."""
-        with_clocks = self.with_clocks(np.asarray(clocks))
-        first_pose, instant = with_clocks.intervals(
+        motion = self.with_clocks(np.asarray(clocks))
+        first_control, instant = motion.intervals(
             np.arange(len(self.time)), np.zeros(len(self.time))
         )
-        common = with_clocks.clocks.common(self.camera, self.time)
+        common = motion.clocks.common(self.camera, self.time)
         u = (instant.since + common - self.time) * instant.frequency
-        pose_rows = first_pose[:, None] + np.arange(CONTROLS)
+        control_rows = first_control[:, None] + np.arange(CONTROLS)
         return jax.tree.map(
-            np.asarray, _view_poses(jax.tree.map(lambda x: x[pose_rows], controls), u)
+            np.asarray, _view_poses(jax.tree.map(lambda x: x[control_rows], controls), u)
         )
 
 
@@ -151,24 +151,24 @@ def plan_runs(
     A run ends where no photograph is within `gap`. It has at most half as many control poses as
     photographs at different times, so that these determine them with as much redundancy."""
     runs: list[Run] = []
-    run_of_row, first_pose = np.full(len(common), -1), 0
-    for one_body in np.unique(body):
-        rows = np.flatnonzero(body == one_body)
+    run_of_row, first_control = np.full(len(common), -1), 0
+    for body_number in np.unique(body):
+        rows = np.flatnonzero(body == body_number)
         rows = rows[np.argsort(common[rows], kind="stable")]
         ends = np.flatnonzero(np.diff(common[rows]) > gap) + 1
         for part in np.split(rows, ends):
             t = common[part]
             # Photographs of two cameras at one time are one pose.
-            different = 1 + int((np.diff(t) > gap / 100).sum())
-            if different < 2 * CONTROLS:
+            instants = 1 + int((np.diff(t) > gap / 100).sum())
+            if instants < 2 * CONTROLS:
                 continue
             # n intervals have n + 3 control poses
-            max_intervals = different // 2 - CONTROLS + 1
+            max_intervals = instants // 2 - CONTROLS + 1
             intervals = int(np.clip(np.ceil((t[-1] - t[0]) / spacing), 1, max_intervals))
-            run = Run(first_pose, t[0], (t[-1] - t[0]) / intervals, intervals)
+            run = Run(first_control, t[0], (t[-1] - t[0]) / intervals, intervals)
             run_of_row[part] = len(runs)
             runs.append(run)
-            first_pose += run.controls
+            first_control += run.controls
     return tuple(runs), run_of_row
 
 
@@ -193,12 +193,12 @@ def control_poses(
         k = np.clip(
             np.searchsorted(common[rows], control_times, side="right") - 1, 0, len(rows) - 2
         )
-        previous, following = rows[k], rows[k + 1]
-        span = np.maximum(common[following] - common[previous], np.finfo(float).tiny)
-        part = ((control_times - common[previous]) / span)[:, None]
-        position.append(t[previous] + part * (t[following] - t[previous]))
+        previous_rows, next_rows = rows[k], rows[k + 1]
+        span = np.maximum(common[next_rows] - common[previous_rows], np.finfo(float).tiny)
+        part = ((control_times - common[previous_rows]) / span)[:, None]
+        position.append(t[previous_rows] + part * (t[next_rows] - t[previous_rows]))
         rotation.append(
-            np.asarray(_interpolate_rotations(inverse[previous], inverse[following], part))
+            np.asarray(_interpolate_rotations(inverse[previous_rows], inverse[next_rows], part))
         )
     return PoseValue(np.concatenate(position), np.concatenate(rotation))
 

@@ -75,11 +75,11 @@ class WandCalibration(TableMethods):
     def mountings(self) -> dict[str, Mounting]:
         """The mounting of every camera but the first in the frame of that, with its covariance."""
         row = {name: k for k, name in enumerate(self.adjustment.problem.network.images.id)}
-        first_row, *other_rows = (row[name] for name in self.names)
-        C = np.asarray(self.adjustment.covariance_of(_Mountings(first_row, tuple(other_rows))))
+        reference_row, *other_rows = (row[name] for name in self.names)
+        C = np.asarray(self.adjustment.covariance_of(_Mountings(reference_row, tuple(other_rows))))
         mountings_found = {}
         for k, name in enumerate(self.names[1:]):
-            pose = _relative(self.adjustment.values["image"], first_row, other_rows[k])
+            pose = _relative(self.adjustment.values["image"], reference_row, other_rows[k])
             covariance, base = (
                 C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].copy(),
                 np.asarray(pose.position),
@@ -103,8 +103,8 @@ class WandCalibration(TableMethods):
         return network_of_rig(
             Path("rig"),
             adjusted,
-            [np.eye(3), *(camera_of_network.rotation for camera_of_network in mountings)],
-            [np.zeros(3), *(camera_of_network.base for camera_of_network in mountings)],
+            [np.eye(3), *(mounting.rotation for mounting in mountings)],
+            [np.zeros(3), *(mounting.base for mounting in mountings)],
         )
 
     def table(self) -> dict[str, np.ndarray]:
@@ -155,24 +155,24 @@ class _Mountings:
     Poses of networks are in the datum of all points (inner constraints): only relative ones, and
     their σ, do not depend on it."""
 
-    first: int
-    others: tuple[int, ...]
+    reference_row: int
+    other_rows: tuple[int, ...]
 
     def __call__(self, values: Mapping[str, Any]) -> Array:
         changes = []
-        for k in self.others:
-            pose = _relative(values["image"], self.first, k)
+        for k in self.other_rows:
+            pose = _relative(values["image"], self.reference_row, k)
             R = matrix_from_quaternion(pose.rotation)
             turn = rotation_vector_from_matrix(R @ jax.lax.stop_gradient(R).T)
             changes += [jnp.asarray(pose.position), turn]
         return jnp.concatenate(changes)
 
 
-def _relative(images: PoseValue, first_row: int, k: int) -> PoseValue:
+def _relative(images: PoseValue, reference_row: int, k: int) -> PoseValue:
     """The pose of an image in the frame of another one."""
-    M = matrix_from_quaternion(images.rotation[first_row])
+    M = matrix_from_quaternion(images.rotation[reference_row])
     R = matrix_from_quaternion(images.rotation[k]) @ M.T
-    base = M @ (images.position[k] - images.position[first_row])
+    base = M @ (images.position[k] - images.position[reference_row])
     return PoseValue(base, quaternion_from_matrix(R))
 
 
@@ -243,8 +243,10 @@ def calibrate_wand(
     marks = {name: (measured if name in images else tables)[name] for name in markers}
     marks, remarks = name_markers(marks, cameras, pairs, settings or WandSettings())
     notes += remarks
-    declare = lambda marks: _network(marks, cameras, pairs, sigma_length, sigma_image, object_unit)
-    network, remarks = declare(marks)
+    network_of_marks = lambda marks: _network(
+        marks, cameras, pairs, sigma_length, sigma_image, object_unit
+    )
+    network, remarks = network_of_marks(marks)
     result = adjust(network, **options)
     if images and sigma_image is None and result.converged:
         # σ by the noise of the grey values: compression smooths it, and shifts centres by more.
@@ -252,7 +254,7 @@ def calibrate_wand(
         factor = _residuals_over_sigma(result, images)
         for name in images:
             marks[name] = [m._replace(sx=factor * m.sx, sy=factor * m.sy) for m in marks[name]]
-        result = adjust(declare(marks)[0], **options)
+        result = adjust(network_of_marks(marks)[0], **options)
         remarks += [f"σ of markers in images: {factor:.2f} times what the noise says, by residuals"]
     longest = max(pairs.values())
     # Nobody waves a wand of ten metres; in millimetres it would be one of a centimetre at least.
@@ -269,9 +271,9 @@ def _residuals_over_sigma(result: Adjustment, cameras: Collection[str]) -> float
     rows = (table["kind"] == "image") & np.isin(table["image"].astype(str), [*cameras])
     ratio, r = (table["v"] / table["sigma"])[rows], table["r"][rows]
     is_tested = np.isfinite(ratio) & (r > 0)
-    size = float(np.sqrt((ratio[is_tested] ** 2).sum() / max(r[is_tested].sum(), 1.0)))
+    factor = float(np.sqrt((ratio[is_tested] ** 2).sum() / max(r[is_tested].sum(), 1.0)))
     # Exact images leave nothing.
-    return size if size > 0 else 1.0
+    return factor if factor > 0 else 1.0
 
 
 def _marks(camera: str, source: Any) -> Marks:
@@ -285,8 +287,7 @@ def _marks(camera: str, source: Any) -> Marks:
     if not isinstance(table, Mapping):
         raise InputError(
             f"{source_in_words}: got {show(source)}; expected a table with the columns {COLUMNS}, "
-            "or its path, "
-            "or images"
+            "or its path, or images"
         )
     for name in ("frame", "x", "y"):
         if name not in table:

@@ -69,11 +69,11 @@ class Wand:
 class WandBody:
     """A wand with start values.
 
-    **Fields:** `found`: the cameras by the wand alone; `cameras` that see no board; `ends`: the
-    names of the markers used; `length` and `sigma_length` of them; `sigma_image` of markers without
-    a σ of their own, pixels."""
+    **Fields:** `calibration`: the cameras by the wand alone; `cameras` that see no board; `ends`:
+    the names of the markers used; `length` and `sigma_length` of them; `sigma_image` of markers
+    without a σ of their own, pixels."""
 
-    found: WandCalibration
+    calibration: WandCalibration
     cameras: dict[str, Camera]
     ends: tuple[str, str]
     length: float
@@ -85,7 +85,9 @@ class WandBody:
         `epoch` on: as many as tie cameras surely."""
         poses = self._poses()
         return [
-            BoardView(cameras.index(name), board, epoch + k, pose, len(self.found.markers[name]))
+            BoardView(
+                cameras.index(name), board, epoch + k, pose, len(self.calibration.markers[name])
+            )
             for name, pose in poses.items()
             for k in range(MIN_SHARED_EPOCHS)
         ]
@@ -93,9 +95,9 @@ class WandBody:
     def _poses(self) -> dict[str, Float[np.ndarray, "4 4"]]:
         """From the frame of the wand's network to each camera."""
         # Its cameras have one image each, which has their name.
-        images = self.found.adjustment.values["image"]
+        images = self.calibration.adjustment.values["image"]
         poses = {}
-        for k, name in enumerate(self.found.adjustment.problem.network.images.id):
+        for k, name in enumerate(self.calibration.adjustment.problem.network.images.id):
             M = np.asarray(matrix_from_quaternion(images.rotation[k]))
             poses[name] = transformation(M, -M @ np.asarray(images.position[k]))
         return poses
@@ -105,7 +107,7 @@ class WandBody:
         name, pose = next(iter(self._poses().items()))
         # Any camera of both ties the frames; what is left is a matter of the adjustment.
         to_rig = np.linalg.inv(mountings[name]) @ pose
-        adjustment = self.found.adjustment
+        adjustment = self.calibration.adjustment
         position_of = dict(
             zip(adjustment.problem.network.points.id, np.asarray(adjustment.values["point"]))
         )
@@ -141,9 +143,8 @@ def start_wand(
     missing_cameras = [name for name in wand.markers if name not in known_cameras]
     if missing_cameras:
         raise InputError(
-            f"wand: camera {missing_cameras[0]!r} sees no board; expected its interior "
-            "orientation in "
-            "cameras (--cameras)"
+            f"wand: camera {missing_cameras[0]!r} sees no board; expected its interior orientation "
+            "in cameras (--cameras)"
         )
     # Their interior orientation is that of the boards; the wand alone would weaken it.
     hold = lambda camera: dataclasses.replace(camera, free=(), sigma={}, observed={})
@@ -193,7 +194,7 @@ def add_wand(
     names = [camera.id for camera in rig.cameras]
     ends = wand.points(dict(zip(names, connections.mountings)))
     marks_of_frame: dict[str, list[tuple[int, int, Any]]] = {frame: [] for frame in ends}
-    for name, marks in wand.found.markers.items():
+    for name, marks in wand.calibration.markers.items():
         for mark in marks:
             if mark.frame in marks_of_frame and mark.marker in wand.ends:
                 point = len(rig.ids) + wand.ends.index(mark.marker)
@@ -276,7 +277,7 @@ def _in_units(
     own_sigma = np.array([(mark.sx, mark.sy) for mark in marks])
     # As large as the residuals of the wand's network say.
     sigma = np.where(np.isfinite(own_sigma), own_sigma, wand.sigma_image)
-    sigma = sigma * wand.found.adjustment.sigma0 / _sigma0(calibrations)
+    sigma = sigma * wand.calibration.adjustment.sigma0 / _sigma0(calibrations)
     xy = np.empty_like(uv)
     for k in np.unique(camera):
         camera_of_rig, rows = rig.cameras[k], camera == k

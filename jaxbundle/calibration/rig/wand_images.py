@@ -68,20 +68,19 @@ def measure_wand(
             f"{settings.max_blobs} blobs"
         ] * bool(crowded)
     names = {
-        camera: tuple(dict.fromkeys(m.frame for m in frames_of_camera))
-        for camera, frames_of_camera in marks_found.items()
+        camera: tuple(dict.fromkeys(m.frame for m in marks_of_camera))
+        for camera, marks_of_camera in marks_found.items()
     }
     keys = epoch_keys(
-        names | {name: tuple(frames_of_camera) for name, frames_of_camera in given_frames.items()},
+        names | {name: tuple(frame_names) for name, frame_names in given_frames.items()},
         connected=False,
     )
     by_camera = {
-        camera: dict(zip(frames_of_camera, keys[camera]))
-        for camera, frames_of_camera in names.items()
+        camera: dict(zip(frame_names, keys[camera])) for camera, frame_names in names.items()
     }
     return {
-        camera: [mark._replace(frame=by_camera[camera][mark.frame]) for mark in frames_of_camera]
-        for camera, frames_of_camera in marks_found.items()
+        camera: [mark._replace(frame=by_camera[camera][mark.frame]) for mark in marks_of_camera]
+        for camera, marks_of_camera in marks_found.items()
     }, notes
 
 
@@ -113,27 +112,27 @@ class _Frames:
 def _measure(
     camera: str,
     frames: _Frames,
-    camera_known: Camera,
+    interior: Camera,
     settings: BlobSettings,
     progress: Progress | None,
 ) -> tuple[Marks, int]:
     """The markers of a camera, and the number of frames without any."""
     scene = find_still_scene((grey for _, grey in frames), settings)
     size = scene.background.shape[::-1]
-    if camera_known.image_size is not None and tuple(camera_known.image_size) != size:
+    if interior.image_size is not None and tuple(interior.image_size) != size:
         raise InputError(
             "the frames have {} × {} pixels, its interior orientation is of {} × {}".format(
-                *size, *camera_known.image_size
+                *size, *interior.image_size
             )
         )
-    marks, without = [], 0
+    marks, empty_frames = [], 0
     for number_done, (name, grey) in enumerate(frames, 1):
         targets = find_moving_blobs(grey, scene, settings)
-        without += not targets
+        empty_frames += not targets
         marks += [Mark(name, "", *t.xy.tolist(), *t.sigma.tolist()) for t in targets]
         if progress is not None:
             progress(f"{SEARCHING}, camera {camera}", number_done, frames.number)
-    return marks, without
+    return marks, empty_frames
 
 
 def replaced_sigma(marks: Marks, sigma: float) -> Marks:

@@ -43,7 +43,7 @@ Marks = list[Mark]
 # By frame, its markers.
 ByFrame = dict[str, Marks]
 # Of two frames of one name the assignment: markers in the same order, or the other way round.
-Turns = dict[str, bool]
+Reversals = dict[str, bool]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,24 +109,24 @@ def name_three(
     """Names of three markers in a line by their distances, in every frame in which exactly three
     blobs can be such."""
     names = sorted({name for pair in pairs for name in pair})
-    size = {frozenset(pair): length for pair, length in pairs.items()}
-    if len(names) != 3 or len(size) < 2:
+    length_of_pair = {frozenset(pair): length for pair, length in pairs.items()}
+    if len(names) != 3 or len(length_of_pair) < 2:
         raise InputError(
             f"markers of camera {camera!r} have no names (marker): only two, or three in a line, "
             "whose distances are given, can be told apart"
         )
     # The pair that is not given, or the longest, are the ends.
-    other_ends = [frozenset(n for n in names if n != end_name) for end_name in names]
-    middle = max(range(3), key=lambda k: size.get(other_ends[k], np.inf))
+    other_names = [frozenset(n for n in names if n != middle_name) for middle_name in names]
+    middle = max(range(3), key=lambda k: length_of_pair.get(other_names[k], np.inf))
     ends = [name for name in names if name != names[middle]]
-    distances = [size[frozenset((names[middle], end))] for end in ends]
+    distances = [length_of_pair[frozenset((names[middle], end))] for end in ends]
     if max(distances) < settings.min_ratio * min(distances):
         raise InputError(
             f"markers of camera {camera!r} have no names (marker), and the middle one is nearly "
             f"half way between the others ({distances[0]:g}, {distances[1]:g}): they cannot be "
             "told apart"
         )
-    near_end, far_end = ends if distances[0] < distances[1] else ends[::-1]
+    near_name, far_name = ends if distances[0] < distances[1] else ends[::-1]
     named_marks: Marks = []
     seen_ratios: list[float] = []
     without = ambiguous = 0
@@ -141,7 +141,7 @@ def name_three(
         # For the message where none fits: a wrong length in the table shows in this ratio.
         seen_ratios += [observed for _, observed in straight]
         if len(possible) == 1:
-            names_and_rows = zip((near_end, names[middle], far_end), possible[0])
+            names_and_rows = zip((near_name, names[middle], far_name), possible[0])
             named_marks += [marks_of_frame[k]._replace(marker=name) for name, k in names_and_rows]
     if not named_marks:
         usual = f"; those in a line are at 1 : {np.median(seen_ratios):.1f}" if seen_ratios else ""
@@ -188,10 +188,10 @@ def _straight_triples(
 
 
 def _by_frame(marks: Marks) -> ByFrame:
-    frames: ByFrame = {}
+    marks_by_frame: ByFrame = {}
     for mark in marks:
-        frames.setdefault(mark.frame, []).append(mark)
-    return frames
+        marks_by_frame.setdefault(mark.frame, []).append(mark)
+    return marks_by_frame
 
 
 def _name_two(
@@ -216,22 +216,24 @@ def _name_two(
         mark.marker for marks_of_camera in marks.values() for mark in marks_of_camera
     } - {""}
     names = sorted(names_given) if len(names_given) == 2 else ["A", "B"]
-    xy = {
+    rays = {
         camera: {
             frame: ideal_features(cameras[camera], np.array([(m.x, m.y) for m in marks_of_frame]))
-            for frame, marks_of_frame in marks_of_camera.items()
+            for frame, marks_of_frame in marks_by_frame.items()
         }
-        for camera, marks_of_camera in frames.items()
+        for camera, marks_by_frame in frames.items()
     }
     # Rays have c = 1, the tolerance is in pixels.
     tolerance = {camera: settings.tolerance * _pixel(cameras[camera]) for camera in marks}
-    turns: dict[tuple[str, str], Turns] = {}
+    reversals: dict[tuple[str, str], Reversals] = {}
     for camera_a, camera_b in combinations(marks, 2):
         if camera_a in nameless or camera_b in nameless:
             limit = max(tolerance[camera_a], tolerance[camera_b])
-            turns[camera_a, camera_b] = _turns_of_pair(xy[camera_a], xy[camera_b], limit, settings)
+            reversals[camera_a, camera_b] = _reversals_of_pair(
+                rays[camera_a], rays[camera_b], limit, settings
+            )
         else:
-            turns[camera_a, camera_b] = dict.fromkeys(
+            reversals[camera_a, camera_b] = dict.fromkeys(
                 frames[camera_a].keys() & frames[camera_b].keys(), False
             )
     named_marks: dict[str, Marks] = {camera: [] for camera in marks}
@@ -239,14 +241,16 @@ def _name_two(
     # Named cameras first: the others follow their names.
     order = [*(c for c in marks if c not in nameless), *nameless]
     for frame in dict.fromkeys(
-        frame for marks_of_camera in frames.values() for frame in marks_of_camera
+        frame for marks_by_frame in frames.values() for frame in marks_by_frame
     ):
-        seeing = [camera for camera in order if frame in frames[camera]]
-        turned = _turns_of_frame(frame, seeing, turns)
-        contradicting += turned is None
-        undecided += turned is not None and len(turned) < len(seeing)
-        for camera, turn in (turned or {}).items():
-            pair = frames[camera][frame][:: -1 if turn else 1]
+        cameras_with_markers = [camera for camera in order if frame in frames[camera]]
+        reversal_of_camera = _reversals_of_frame(frame, cameras_with_markers, reversals)
+        contradicting += reversal_of_camera is None
+        undecided += reversal_of_camera is not None and len(reversal_of_camera) < len(
+            cameras_with_markers
+        )
+        for camera, is_reversed in (reversal_of_camera or {}).items():
+            pair = frames[camera][frame][:: -1 if is_reversed else 1]
             named_marks[camera] += [m._replace(marker=name) for m, name in zip(pair, names)]
     remarks = [
         f"{count(number, 'frame')} {why} not used"
@@ -279,66 +283,70 @@ def _pixel(camera: Camera) -> float:
     return float(np.linalg.norm(np.diff(ideal_features(camera, middle + [[0, 0], [1, 0]]), axis=0)))
 
 
-def _turns_of_pair(
-    marks_a: Mapping[str, Float[np.ndarray, "2 2"]],
-    marks_b: Mapping[str, Float[np.ndarray, "2 2"]],
+def _reversals_of_pair(
+    rays_a: Mapping[str, Float[np.ndarray, "2 2"]],
+    rays_b: Mapping[str, Float[np.ndarray, "2 2"]],
     tolerance: float,
     settings: WandSettings,
-) -> Turns:
+) -> Reversals:
     """Of the common frames of two cameras whose assignment is clear, which it is."""
-    common = [
+    common_frames = [
         frame
-        for frame in marks_a
-        if frame in marks_b and np.isfinite([marks_a[frame], marks_b[frame]]).all()
+        for frame in rays_a
+        if frame in rays_b and np.isfinite([rays_a[frame], rays_b[frame]]).all()
     ]
     # 5 points determine an orientation and 5 frames have 20 pairings, half of them wrong; with
     # three times as many a wrong one does not agree by chance
-    if len(common) < 15:
+    if len(common_frames) < 15:
         return {}
-    a = np.array([marks_a[frame] for frame in common])
-    b = np.array([marks_b[frame] for frame in common])
+    a = np.array([rays_a[frame] for frame in common_frames])
+    b = np.array([rays_b[frame] for frame in common_frames])
     # Straight pairings, and crossed ones.
     points_a, points_b = np.concatenate([a, a]), np.concatenate([b, b[:, ::-1]])
     # Mixed, since a search with gross errors may take the first ones for good.
-    mixed = np.random.default_rng(0).permutation(4 * len(common))
-    xy1, xy2 = points_a.reshape(-1, 2)[mixed], points_b.reshape(-1, 2)[mixed]
+    permutation = np.random.default_rng(0).permutation(4 * len(common_frames))
+    xy1, xy2 = points_a.reshape(-1, 2)[permutation], points_b.reshape(-1, 2)[permutation]
     M, base, _, _ = batched.orient_pairs([xy1], [xy2], np.array([tolerance]))
-    distances = jax.vmap(sampson_distance, (None, None, 0, 0))
-    distance = np.abs(distances(M[0], base[0], points_a.reshape(-1, 2), points_b.reshape(-1, 2)))
+    distances_of_pairs = jax.vmap(sampson_distance, (None, None, 0, 0))
+    distance = np.abs(
+        distances_of_pairs(M[0], base[0], points_a.reshape(-1, 2), points_b.reshape(-1, 2))
+    )
     fits = np.asarray((distance.reshape(2, -1, 2) < tolerance).all(2))
     # Both fit where the wand lies in the epipolar plane: nothing tells them apart there.
     clear = fits[0] != fits[1]
     if clear.mean() < settings.min_agreeing:
         return {}
-    return {frame: bool(fits[1, k]) for k, frame in enumerate(common) if clear[k]}
+    return {frame: bool(fits[1, k]) for k, frame in enumerate(common_frames) if clear[k]}
 
 
-def _turns_of_frame(
-    frame: str, cameras: Sequence[str], turns: Mapping[tuple[str, str], Turns]
+def _reversals_of_frame(
+    frame: str, cameras: Sequence[str], reversals: Mapping[tuple[str, str], Reversals]
 ) -> dict[str, bool] | None:
     """Of the cameras of a frame that hang together, which have the other order; None if pairs of
     them contradict each other."""
-    turn_of_pair: dict[tuple[str, str], bool] = {}
-    for (camera_a, camera_b), of_pair in turns.items():
+    reversal_of_pair: dict[tuple[str, str], bool] = {}
+    for (camera_a, neighbour), of_pair in reversals.items():
         if frame in of_pair:
-            turn_of_pair[camera_a, camera_b] = turn_of_pair[camera_b, camera_a] = of_pair[frame]
+            reversal_of_pair[camera_a, neighbour] = reversal_of_pair[neighbour, camera_a] = of_pair[
+                frame
+            ]
     best: dict[str, bool] = {}
     for start in cameras:
         if start in best:
             continue
-        turn_of_camera, reached = {start: False}, [start]
+        reversal_of_camera, reached = {start: False}, [start]
         for camera in reached:
-            for camera_b in cameras:
-                if (camera, camera_b) not in turn_of_pair:
+            for neighbour in cameras:
+                if (camera, neighbour) not in reversal_of_pair:
                     continue
-                turn = turn_of_camera[camera] ^ turn_of_pair[camera, camera_b]
-                if camera_b not in turn_of_camera:
-                    turn_of_camera[camera_b] = turn
-                    reached.append(camera_b)
+                is_reversed = reversal_of_camera[camera] ^ reversal_of_pair[camera, neighbour]
+                if neighbour not in reversal_of_camera:
+                    reversal_of_camera[neighbour] = is_reversed
+                    reached.append(neighbour)
                 # A loop of cameras that does not close: one of its pairs is wrong.
-                elif turn_of_camera[camera_b] != turn:
+                elif reversal_of_camera[neighbour] != is_reversed:
                     return None
         # The largest group stands for the frame; others have no order in common with it.
-        if len(turn_of_camera) > len(best):
-            best = turn_of_camera
+        if len(reversal_of_camera) > len(best):
+            best = reversal_of_camera
     return best if len(best) > 1 else {}
