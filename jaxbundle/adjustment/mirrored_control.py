@@ -93,8 +93,7 @@ def name_other_side(network: Network, images: dict[str, Float[np.ndarray, "3"]])
         return ""
     return (
         f"{count(int(is_on_other_side.sum()), 'image')} of {len(rows)} moved from the start value "
-        "to the "
-        f"other side of the control points, where their mirror image is seen: {REMEDY}"
+        f"to the other side of the control points, where their mirror image is seen: {REMEDY}"
     )
 
 

@@ -110,8 +110,7 @@ def convert_camera(
     if has_ray.mean() < MEASURABLE:
         raise ValueError(
             f"only {100 * has_ray.mean():.0f} % of the image has a ray in model {source.name!r}: "
-            "its "
-            "distortion turns back inside the image"
+            "its distortion turns back inside the image"
         )
     target_images, rays = (shift + step * xy)[has_ray], rays[has_ray]
     if not target.wide and (rays[:, 2] >= 0).any():

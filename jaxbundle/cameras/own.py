@@ -48,8 +48,7 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
     if model.inverse is not None and not misclosure <= 1e-9 * size:
         raise ValueError(
             f"{where}inverse is not the inverse of its formula: a point comes back "
-            f"{misclosure:.3g} "
-            f"{model.unit} beside itself; omit inverse, and it is computed"
+            f"{misclosure:.3g} {model.unit} beside itself; omit inverse, and it is computed"
         )
 
 

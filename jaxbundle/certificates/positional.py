@@ -158,8 +158,7 @@ class PositionalAccuracy(TableMethods):
             elif survey > product / 2:
                 sentences.append(
                     f"the {direction} survey of the check points ({significant(survey)} "
-                    f"{self.unit}) is "
-                    "not twice as accurate as the product"
+                    f"{self.unit}) is not twice as accurate as the product"
                 )
         return sentences
 

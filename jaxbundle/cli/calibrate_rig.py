@@ -245,9 +245,8 @@ def wand_given(
     cameras_without_board = [name for name in markers if name not in cameras]
     if cameras_without_board and not files:
         raise InputError(
-            f"--wand-camera: there is no folder of camera {cameras_without_board[0]!r}, so that "
-            "it sees no board; "
-            "expected its interior orientation, NAME=FILE"
+            f"--wand-camera: there is no folder of camera {cameras_without_board[0]!r}, so that it "
+            "sees no board; expected its interior orientation, NAME=FILE"
         )
     return Wand(
         markers,

@@ -220,10 +220,9 @@ def require_solved(calibrations: Calibrations) -> None:
         others_in_words = f"; {number_of_others} not solved either: {', '.join(failed[1:])}"
         raise NotSolvedError(
             f"not solved: camera {failed[0]}: "
-            f"{calibrations.cameras[failed[0]].adjustment.termination}"
-            f"{undetermined}; free fewer parameters (--free), or take photographs from more "
-            "directions"
-            f"{others_in_words if len(failed) > 1 else ''}"
+            f"{calibrations.cameras[failed[0]].adjustment.termination}{undetermined}; free fewer "
+            "parameters (--free), or take photographs from more "
+            f"directions{others_in_words if len(failed) > 1 else ''}"
         )
 
 
@@ -236,8 +235,7 @@ def check_names(cameras: Iterable[str]) -> None:
         if earlier != name:
             raise InputError(
                 f"--camera: {earlier!r} and {name!r} would have the same folder "
-                f"{file_name(name)!r}; "
-                "choose other names"
+                f"{file_name(name)!r}; choose other names"
             )
 
 

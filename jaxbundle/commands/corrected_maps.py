@@ -315,7 +315,6 @@ def _open_truth(path: Path, file: ScannerInput | RpcInput, tell: Message) -> Pus
     if size != image_size:
         raise InputError(
             f"--truth {path}: {size[0]} lines of {size[1]} pixels, the scanner file has "
-            f"{image_size[0]} "
-            f"of {image_size[1]}"
+            f"{image_size[0]} of {image_size[1]}"
         )
     return truth.image

@@ -153,8 +153,7 @@ class HandEye(TableMethods):
         return [
             f"{excess} worse than their σ: is the camera mounted as said ({self.poses.type}, not "
             f"{other_mounting}), do poses and photographs belong together, and are the units and "
-            "the order "
-            "of the rotations those of the robot?"
+            "the order of the rotations those of the robot?"
         ]
 
 

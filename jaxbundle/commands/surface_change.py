@@ -275,8 +275,7 @@ def _check_systems(before: CellSource, after: CellSource) -> None:
     if not system_before.equals(system_after, ignore_axis_order=True):
         raise InputError(
             f"two rasters are in different coordinate systems, {system_before.name} and "
-            f"{system_after.name}; "
-            "transform one (gdalwarp -t_srs)"
+            f"{system_after.name}; transform one (gdalwarp -t_srs)"
         )
 
 

@@ -310,8 +310,8 @@ def check(tables: Sequence[Table], observations: Sequence[ObservationSet]) -> No
                 row = int(np.argmax(bad))
                 raise InputError(
                     f"{observation_set.kind.name}: observation {row + 1} touches row "
-                    f"{int(rows[row])} of "
-                    f"table {name!r}, which has rows 0 to {table_of[name].rows - 1}"
+                    f"{int(rows[row])} of table {name!r}, which has rows 0 to "
+                    f"{table_of[name].rows - 1}"
                 )
 
 
@@ -352,8 +352,7 @@ def check_numbers(
                 row = int(np.argwhere(bad)[0][0])
                 raise InputError(
                     f"observation {row + 1}, {observation_set.label(tables, row)}: a measured "
-                    "value is not a "
-                    "finite number; an infinite sigma leaves an observation out"
+                    "value is not a finite number; an infinite sigma leaves an observation out"
                 )
 
 

@@ -45,8 +45,7 @@ def join_views(views: Mapping[str, BoardViews]) -> BoardViews:
         sizes_in_words = ", ".join(f"{c} × {r} of {name!r}" for name, (c, r) in sizes.items())
         raise InputError(
             f"views of boards have different image sizes: {sizes_in_words}; expected photographs "
-            "of one "
-            "camera, all of one size"
+            "of one camera, all of one size"
         )
     known_boards = require_boards(
         {name: views_of_board.board for name, views_of_board in views.items()}

@@ -262,9 +262,8 @@ def refuse_sizes(sizes: Mapping[str, tuple[int, int]]) -> None:
         for (columns, rows), number in numbers.most_common()
     )
     raise InputError(
-        f"photographs have different sizes: {sizes_in_words}; expected those of one camera, all "
-        "of one "
-        "size: move the others to a folder of their own"
+        f"photographs have different sizes: {sizes_in_words}; expected those of one camera, all of "
+        "one size: move the others to a folder of their own"
     )
 
 
@@ -336,8 +335,7 @@ def _find_saved_again(used_views: Sequence[tuple[str, np.ndarray]]) -> dict[str,
             if rms < 0.02:
                 repeated[name] = (
                     f"shows the board where {earlier_name} does, to {rms:.1g} px: the same "
-                    "photograph "
-                    "saved again, or another of the same pose; one is used"
+                    "photograph saved again, or another of the same pose; one is used"
                 )
                 break
     return repeated

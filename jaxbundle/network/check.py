@@ -416,6 +416,6 @@ def _note_points_behind(network: Network) -> Network:
     examples = "; ".join(_sighting(network, row) for row in rows_behind[:3])
     return network.note(
         f"the start values put {count(len(rows_behind), 'image point')} behind the camera: "
-        f"{examples}"
-        f"{' …' if len(rows_behind) > 3 else ''}; check the start values and the angle unit"
+        f"{examples}{' …' if len(rows_behind) > 3 else ''}; check the start values and the angle "
+        "unit"
     )

@@ -107,10 +107,9 @@ def name_unit_of_positions(network: Network, images: dict[str, Float[np.ndarray,
     if not (np.abs(decades - 3) < np.log10(1.1)).all():
         return ""
     return (
-        f"the adjusted projection centres are {adjusted_distance[0] / start_distance[0]:.4g} "
-        "times their start values: "
-        f"is the control in mm, or the start values in m? Expected is one unit of object "
-        f"coordinates, {network.object_unit}"
+        f"the adjusted projection centres are {adjusted_distance[0] / start_distance[0]:.4g} times "
+        "their start values: is the control in mm, or the start values in m? Expected is one unit "
+        f"of object coordinates, {network.object_unit}"
     )
 
 
@@ -127,8 +126,7 @@ def _check_field(camera: Camera, xy: Float[np.ndarray, "rays 2"]) -> str:
             f"camera {camera.id!r}: {name} is {c:g} {model.unit} and half of its image points lie "
             f"more than {median_radius:.4g} {model.unit} from the principal point, "
             f"{np.degrees(np.arctan(median_radius / c)):.1f}° from the axis: no lens has such a "
-            "field of view. "
-            f"{_remedy(camera, model.unit, name, c, median_radius)}"
+            f"field of view. {_remedy(camera, model.unit, name, c, median_radius)}"
         )
     if (
         size is not None

@@ -53,8 +53,7 @@ class Proof:
         failures = f", {self.failed} of them not solved" if self.failed else ""
         return (
             f"{self.found:.4g} from {self.draws} simulated networks{failures}, "
-            f"{self.predicted:.4g} "
-            f"predicted: ratio {self.ratio:.3f} (limit 1 ± {self.limit:.3f}) "
+            f"{self.predicted:.4g} predicted: ratio {self.ratio:.3f} (limit 1 ± {self.limit:.3f}) "
             f"{'agrees' if self.agrees else 'DOES NOT AGREE'}"
         )
 

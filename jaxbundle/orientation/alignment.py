@@ -178,9 +178,8 @@ def describe_mirror(network: Network, model: Model, settings: StartValueSettings
     return (
         f"the {len(source)} control points fit the images only as a mirror image (by "
         f"{misfits[1]:.3g} {network.object_unit}, otherwise {misfits[0]:.3g}): X and Y are "
-        "exchanged, or "
-        "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; reverse one "
-        "axis"
+        "exchanged, or one of X, Y, Z has the wrong sign, or the image coordinates count y "
+        "downward; reverse one axis"
     )
 
 

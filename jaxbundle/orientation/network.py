@@ -447,7 +447,6 @@ def _why_nothing(network: Network, sights: Sights, settings: StartValueSettings)
         )
     return (
         f"{first_clause}no two images share {fewest} points whose rays meet at an angle "
-        f"({max_common} "
-        "points in common at most): take images from different positions, look for wrong point "
-        "numbers, or give start values"
+        f"({max_common} points in common at most): take images from different positions, look for "
+        "wrong point numbers, or give start values"
     )

@@ -62,8 +62,7 @@ def with_attitudes(
     if np.median(deviation / sigma) > 3:
         return network, (
             f"attitudes in the files are off by {np.degrees(np.median(deviation)):.0f} degrees "
-            "(median) "
-            "from those of the photographs and their positions: not used"
+            "(median) from those of the photographs and their positions: not used"
         )
     # One σ about all axes: the largest that the file states.
     angles = np.asarray(batched.angles(M))

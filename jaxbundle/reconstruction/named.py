@@ -180,8 +180,7 @@ def name_unused(
     if distances and len(unseen) == len(distances):
         raise InputError(
             f"no scale bar has both ends in two photographs ({list_some(unseen, 3, str)}): check "
-            "the "
-            "names of the targets"
+            "the names of the targets"
         )
     notes = [f"scale bars that are not in two photographs: {list_some(unseen, 3, str)}"] * bool(
         unseen

@@ -152,8 +152,7 @@ def _judge_control(part: ReconstructedPart) -> list[Finding]:
     used_points, left_out = [p for p in given_points if p.used], part.control.left_out
     words = (
         f"{len(used_points)} of {count(len(given_points), 'control point')} used, RMS "
-        f"{rms('control')} "
-        f"{part.control.unit}; {part.control.sigma}"
+        f"{rms('control')} {part.control.unit}; {part.control.sigma}"
     )
     if left_out:
         words += f"; left out: {', '.join(left_out)}"

@@ -187,8 +187,6 @@ def _check_knots(scanner_image: ScannerImage, measured: int) -> None:
     if knots > max_intervals + 1:
         raise InputError(
             f"image {scanner_image.id!r}: knot_spacing = {scanner_image.freedom.knot_spacing:g} s "
-            f"makes {knots:.0f} "
-            f"knots in {span:.4g} s, with {measured} measured points; give "
-            f"{span / max_intervals:.3g} s at "
-            f"least{', or the jitter a prior σ' if free else ''}"
+            f"makes {knots:.0f} knots in {span:.4g} s, with {measured} measured points; give "
+            f"{span / max_intervals:.3g} s at least{', or the jitter a prior σ' if free else ''}"
         )

@@ -30,10 +30,8 @@ def check_columns(
             raise InputError(
                 f"{observations.source.name}: line and pixel seem to be exchanged in image "
                 f"{inputs.ids[i]!r}: points with given coordinates are {distance:.0f} pixels from "
-                "their "
-                f"measurements (median), and {distance_exchanged:.0f} with line and pixel "
-                "exchanged; check the "
-                "names of the columns"
+                f"their measurements (median), and {distance_exchanged:.0f} with line and pixel "
+                "exchanged; check the names of the columns"
             )
 
 

@@ -146,8 +146,7 @@ def check_images(images: Sequence[AnyScannerImage]) -> None:
         if not is_same_earth(scanner_image.earth, images[0].earth):
             raise InputError(
                 f"refine: images {images[0].id!r} and {scanner_image.id!r} have different "
-                "ellipsoids or "
-                "frames; points can be in one only (images with RPC are in WGS84)"
+                "ellipsoids or frames; points can be in one only (images with RPC are in WGS84)"
             )
         if isinstance(scanner_image, ScannerImage):
             if scanner_image.freedom.knot_spacing <= 0:
@@ -158,15 +157,13 @@ def check_images(images: Sequence[AnyScannerImage]) -> None:
         shape = np.shape(scanner_image.bias_sigma)
         if len(shape) != 2 or shape[0] != 2 or shape[1] not in BIAS_TERMS:
             raise InputError(
-                f"image {scanner_image.id!r}: σ of its bias have the shape {list(shape)}; "
-                "expected [2, 1], "
-                "[2, 3] or [2, 6], of lines and of samples"
+                f"image {scanner_image.id!r}: σ of its bias have the shape {list(shape)}; expected "
+                "[2, 1], [2, 3] or [2, 6], of lines and of samples"
             )
         if not (np.asarray(scanner_image.bias_sigma) >= 0).all():
             raise InputError(
-                f"image {scanner_image.id!r}: a σ of its bias is negative or NaN; expected "
-                "pixels, 0 to hold "
-                "it, inf to free it"
+                f"image {scanner_image.id!r}: a σ of its bias is negative or NaN; expected pixels, "
+                "0 to hold it, inf to free it"
             )
 
 
@@ -213,8 +210,7 @@ def _check_on_image(
     raise InputError(
         f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in image "
         f"{scanner_image.id!r}: {('line', 'pixel')[k]} {observations.xy[row, k]:g} is off the "
-        "image, "
-        f"{which}; expected {low:g} to {high:g}{hint}"
+        f"image, {which}; expected {low:g} to {high:g}{hint}"
     )
 
 
@@ -266,7 +262,6 @@ def _check_times(
             raise InputError(
                 f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in "
                 f"image {scanner_image.id!r}: its line is at {time_outside:.9g} s, {where} the "
-                f"table of {table_name}, "
-                f"{begin:.9g} to {end:.9g} s; give ancillary data for the whole image, or "
-                "leave the point out"
+                f"table of {table_name}, {begin:.9g} to {end:.9g} s; give ancillary data for the "
+                "whole image, or leave the point out"
             )

@@ -229,8 +229,7 @@ def removals(adjustment: Any) -> list[str]:
         )
         lines += paragraph(
             f"Held at {'their defaults' if has_other_default else '0'} because they were not "
-            "significant, "
-            f"in this order: {names}."
+            f"significant, in this order: {names}."
         )
     return lines
 

@@ -196,8 +196,7 @@ def _above_geoid(crs: str, geoid: str | Path | None, beginning: str) -> HeightRe
             requested_by = f"--crs {crs}: its heights are those of {parts.vertical.name!r}"
         raise InputError(
             f"{requested_by}: heights of scanner and RPC images are computed above the ellipsoid; "
-            "give "
-            f"the geoid: --geoid {grid} (a grid of PROJ: projsync --file {grid})"
+            f"give the geoid: --geoid {grid} (a grid of PROJ: projsync --file {grid})"
         )
     if parts.vertical is None:
         system = with_heights_above(parts.horizontal, geoid)

@@ -44,8 +44,7 @@ def read_views(
     if is_oriented.sum() < 2:
         raise InputError(
             f"{path}: {is_oriented.sum()} oriented images; a surface needs at least two: orient "
-            "them by "
-            "jaxbundle adjust --out and give its folder here"
+            "them by jaxbundle adjust --out and give its folder here"
         )
     files = find_photographs(network.images.id, Path(folder))
     greys = [read_photograph(file) for file in files]
@@ -119,8 +118,7 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
     if missing_names:
         raise InputError(
             f"--photos {folder}: no photograph {list_some(missing_names, 5, str)}; the ids of the "
-            "images "
-            "are the names of their files"
+            "images are the names of their files"
         )
     return files_found
 

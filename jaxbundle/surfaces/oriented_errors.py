@@ -157,8 +157,7 @@ def oriented_errors(
     if chosen_images.around is not None and system is None:
         raise InputError(
             f"{chosen_images.path}: its images are on the Earth, the surface has no coordinate "
-            "system; "
-            "give it one (gdal_edit.py -a_srs)"
+            "system; give it one (gdal_edit.py -a_srs)"
         )
     # In the order of the project, and with those of the other surface: L of both then have the same
     # columns, and the common part of an error leaves their difference.
@@ -169,8 +168,7 @@ def oriented_errors(
     if not errors.uncertain:
         raise InputError(
             f"{chosen_images.path}: no covariance of its orientations; adjust it with --out "
-            "(images of "
-            "scanners and RPC: pushbroom refine --out) and give the folder"
+            "(images of scanners and RPC: pushbroom refine --out) and give the folder"
         )
     uses = tuple(view.name in chosen_images.names for view in views_kept)
     # Heights above a geoid are taken as they are: 100 m at 500 km change the effects by 2e-4.

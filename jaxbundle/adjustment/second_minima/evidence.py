@@ -77,8 +77,7 @@ class SecondMinimum:
             )
         return (
             f"{subject}: the iterations ended in the other one; the better one is taken, "
-            f"{both_fits}; "
-            f"{difference}"
+            f"{both_fits}; {difference}"
         )
 
 

@@ -83,8 +83,8 @@ class Tilts(ObservationTable):
         for row, k in np.argwhere(np.abs(readings) > STEEPEST)[:1]:
             raise InputError(
                 f"{table.source(row)}: {AXES[k]} is {readings[row, k] / radians:g}: an axis so "
-                "near to "
-                "the vertical does not show the tilt; expected the readings of the two others"
+                "near to the vertical does not show the tilt; expected the readings of the two "
+                "others"
             )
         return cls(
             image=table.ids("image"),
