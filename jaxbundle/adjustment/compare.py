@@ -210,10 +210,10 @@ def compare(
     **Raises:** `InputError` if they have nothing in common, different units, or too few points for
     a similarity; `NotSolvedError` if one has no result.
     """
-    for name, framed_a in (("a", a), ("b", b)):
-        if not isinstance(framed_a, Adjustment):
+    for name, argument in (("a", a), ("b", b)):
+        if not isinstance(argument, Adjustment):
             raise InputError(
-                f"{name} must be an Adjustment, but is {show(framed_a)}: jaxbundle.adjust "
+                f"{name} must be an Adjustment, but is {show(argument)}: jaxbundle.adjust "
                 "or jaxbundle.load_adjustment gives one"
             )
     if similarity not in (None, True, False):

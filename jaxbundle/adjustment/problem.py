@@ -345,8 +345,8 @@ def _datum(
     if needing_scale and is_scale_open(gauge, network.points.position - origin):
         raise InputError(
             f"{needing_scale[0].source.name}: a σ of {needing_scale[0].TABLE} is a length, but "
-            "nothing gives the "
-            'network a scale: add a distance or control points, or write "exact" (no σ)'
+            "nothing gives the network a scale: add a distance or control points, or write "
+            '"exact" (no σ)'
         )
     return {
         "point": np.repeat(carries_datum[:, None].astype(float), 3, 1)

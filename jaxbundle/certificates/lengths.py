@@ -378,20 +378,18 @@ def length_errors(
         if has_result
     }
     _refuse_observed(adjustment, calibrated)
-    has_result = [
-        i for i, ends in enumerate(calibrated.ends) if all(end in rows_of for end in ends)
-    ]
-    missing = tuple(ends for i, ends in enumerate(calibrated.ends) if i not in set(has_result))
-    if not has_result:
+    testable = [i for i, ends in enumerate(calibrated.ends) if all(end in rows_of for end in ends)]
+    missing = tuple(ends for i, ends in enumerate(calibrated.ends) if i not in set(testable))
+    if not testable:
         raise InputError(
             f"{calibrated.source}: no length has both points in the result; missing are "
             f"{list_some(sorted({e for ends in missing for e in ends if e not in rows_of}))}"
         )
     tested = CalibratedLengths(
-        tuple(calibrated.ends[i] for i in has_result),
-        calibrated.value[has_result],
-        calibrated.sigma[has_result],
-        tuple((calibrated.line or ("",) * len(calibrated))[i] for i in has_result),
+        tuple(calibrated.ends[i] for i in testable),
+        calibrated.value[testable],
+        calibrated.sigma[testable],
+        tuple((calibrated.line or ("",) * len(calibrated))[i] for i in testable),
         calibrated.source,
     )
     rows = np.array([[rows_of[end] for end in ends] for ends in tested.ends])

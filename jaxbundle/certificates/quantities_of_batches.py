@@ -76,9 +76,9 @@ def _parameter(column: str) -> Callable[[Subject, str], QuantityValues]:
         if len(units) > 1:
             raise LookupError(f"{argument} has different units: {', '.join(sorted(units))}")
         return QuantityValues(
-            {label(*camera_and_key): value for camera_and_key, value in named_values.items()},
+            {label(*name_and_key): value for name_and_key, value in named_values.items()},
             units.pop() if units else "",
-            owners={label(*camera_and_key): camera_and_key[1] for camera_and_key in named_values},
+            owners={label(*name_and_key): name_and_key[1] for name_and_key in named_values},
         )
 
     return find

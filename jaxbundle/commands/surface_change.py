@@ -76,8 +76,7 @@ class ChangeResult(TableMethods):
             f"{100 * figures['fallen']:.3g} % fallen",
             f"mean σ of a difference {figures['mean_sigma']:.4g}; scatter of the cells over their "
             f"own σ {figures['sigma_ratio']:.3g} (1 is right{at_level}), which are multiplied by "
-            "it "
-            "if it is above 1",
+            "it if it is above 1",
             f"of neighbouring cells {figures['cells_that_count_as_one']:.3g} count as one; "
             f"{count(figures['shared_errors'], 'error')} common to cells"
             + ("" if figures["shared_errors"] else NOTHING_SHARED),

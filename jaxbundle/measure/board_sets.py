@@ -106,11 +106,10 @@ def measure_board_set(
     )
     looks = dict(zip(tasks, map_in_threads(search, tasks, at_once, tell)))
     refuse_sizes({name: look[0] for (name, _), look in looks.items() if not isinstance(look, str)})
-    views, missed = {}, []
+    views = {}
     for board, searched_board in boards.items():
         looks_of_board = {name: looks[name, board] for name in file_of}
         if all(isinstance(look, str) for look in looks_of_board.values()):
-            missed.append(board)
             continue
         views[board] = collect_views(file_of, looks_of_board, searched_board, hints=False)
     if not views:

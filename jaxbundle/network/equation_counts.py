@@ -229,6 +229,6 @@ def check_redundancy(network: Network) -> None:
         raise InputError(
             f"{network.observations.source.name}: {rows} observations{with_datum} are too few "
             f"for {unknowns} unknowns: {missing_equations} missing; measure more points, free "
-            "fewer camera "
-            "parameters" + ("" if conditions else ', or, without control, set datum = "inner"')
+            "fewer camera parameters"
+            + ("" if conditions else ', or, without control, set datum = "inner"')
         )

@@ -266,8 +266,7 @@ def refuse_arbitrary(aim: Aim, problem: NetworkProblem) -> None:
             raise InputError(
                 "aim: the datum is minimal, so that the σ of points depend on the held "
                 'coordinates; choose inner constraints (datum = "inner"), the datum of smallest '
-                "mean σ "
-                "(design of order zero), or control points"
+                "mean σ (design of order zero), or control points"
             )
         return
     # The derivatives by the seven motions of a similarity; the columns of the gauge are the

@@ -252,23 +252,23 @@ def camera_positions(result: Adjustment) -> CameraPositions | None:
     priors of the images."""
     network, X0 = result.problem.network, result.image_values[:, :3]
     nothing = np.full(3, np.nan)
-    antennas = next((kind for kind in network.further if isinstance(kind, Antennas)), None)
+    antennas = next((table for table in network.further if isinstance(table, Antennas)), None)
     if antennas is not None:
         # The shift of the one strip is the offset of the system; not estimated axes have none.
         row = {id: k for k, id in enumerate(network.images.id)}
         (strip,) = result.further_unknowns.get("GNSS strip", {"": {}}).values()
         shifts = [strip.get(f"shift {axis}", {}) for axis in "XYZ"]
-        shift = np.array([kind.get("value", 0.0) for kind in shifts])
-        sigma = np.array([kind.get("sigma") or np.nan for kind in shifts])
+        shift = np.array([estimate.get("value", 0.0) for estimate in shifts])
+        sigma = np.array([estimate.get("sigma") or np.nan for estimate in shifts])
         offset = np.where(np.isfinite(sigma), shift, np.nan)
         positions_given = zip(antennas.image, antennas.position)
         difference = {id: X0[row[id]] + shift - X for id, X in positions_given if id in row}
         s = np.median(np.sqrt(np.diagonal(antennas.covariance, axis1=1, axis2=2)), axis=0)
         return CameraPositions(difference, s, offset, sigma) if difference else None
     images = network.images
-    positions_given = (np.isfinite(images.sigma[:, :3]) & (images.sigma[:, :3] > 0)).all(1)
-    if not positions_given.any():
+    has_position = (np.isfinite(images.sigma[:, :3]) & (images.sigma[:, :3] > 0)).all(1)
+    if not has_position.any():
         return None
-    difference = {images.id[k]: X0[k] - images.position[k] for k in np.flatnonzero(positions_given)}
-    s = np.median(images.sigma[positions_given, :3], axis=0)
+    difference = {images.id[k]: X0[k] - images.position[k] for k in np.flatnonzero(has_position)}
+    s = np.median(images.sigma[has_position, :3], axis=0)
     return CameraPositions(difference, s, nothing, nothing)

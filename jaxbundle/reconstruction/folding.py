@@ -128,9 +128,8 @@ def count_shared_points(
     network, values = result.network, result.image_values
     X0, M = values[:, :3], np.asarray(batched.matrices(values[:, 3:]))
     X = np.asarray(result.point_values)
-    is_used = result.problem.used
     is_known = np.all(np.isfinite(X), axis=1)
-    is_used &= is_known[result.problem.point]
+    is_used = result.problem.used & is_known[result.problem.point]
     n = len(X0)
     agreeing = _points_of_images(n, result.problem.image[is_used], result.problem.point[is_used])
     measured_points = _points_of_images(n, *_measured_rays(network, measured))

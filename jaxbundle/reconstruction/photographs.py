@@ -104,9 +104,9 @@ def _name_files(paths: Sequence[Path]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class Cameras:
-    """`cameras`, the camera of every photograph (`of`), the principal distance `stated` by its
-    files, and whether it was `given` as calibrated; `notes`; `lens` of every camera:
-    photographs in portrait and landscape format share a lens, with the same principal
+    """`cameras`, and `camera_of` every photograph; of every camera the principal distance that its
+    files state (`stated_distances`); whether it was given as `calibrated`; `notes`; `lens` of every
+    camera: photographs in portrait and landscape format share a lens, with the same principal
     distance and radial distortion."""
 
     cameras: tuple[Camera, ...]

@@ -17,15 +17,13 @@ if TYPE_CHECKING:
 def scale_of_rigs(adjustment: "Adjustment") -> str:
     """Which base of a rig gives the scale, with its σ; empty where other lengths are known."""
     problem, network = adjustment.problem, adjustment.problem.network
-    rigs = next(
-        (mounting_a for mounting_a in network.further if isinstance(mounting_a, Rigs)), None
-    )
+    rigs = next((table for table in network.further if isinstance(table, Rigs)), None)
     if rigs is None or not (rigs.settings.get("mounting") or rigs.settings.get("bases")):
         return ""
     number_known = network.points.has_role("control", "fixed").sum()
     number_known += len(problem.data.measured.get("exterior", ()))
     number_known += (problem.table("image").free == 0).all(1).sum()
-    has_other_scale = any(mounting_a.GIVES_SCALE for mounting_a in network.further)
+    has_other_scale = any(table.GIVES_SCALE for table in network.further)
     if number_known or has_other_scale or len(network.distances):
         return ""
     bases = _given_bases(adjustment, rigs)

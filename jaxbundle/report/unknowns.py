@@ -206,8 +206,7 @@ def points(
             "",
             *paragraph(
                 "Without coordinates, because the rays left by data snooping do not determine "
-                "them: "
-                f"{names}."
+                f"them: {names}."
             ),
         ]
     return [*lines, *_list_of_points(adjustment, max_rows)]

@@ -204,11 +204,10 @@ def _sum_up(
     stable: Cells | None,
 ) -> list[tuple[int, int]]:
     """The normal equations of t̂ of all cells and of stable ones; the tiles with known cells."""
-    usable, heights = [], False
+    usable = []
     for corner in tiles.corners:
         tile = read_tile(corner)
         core = tile.in_core(tile.known)
-        heights = heights or bool(core.any())
         if not core.any():
             continue
         usable.append(corner)

@@ -58,8 +58,7 @@ def check_las(path: Path) -> None:
                 if not math.isfinite(value) or (field_name == "scale" and value == 0):
                     raise InputError(
                         f"{path}: damaged: the {field_name} of {axis} is {value:g}; expected a "
-                        "finite "
-                        "number" + (", not 0" if field_name == "scale" else "")
+                        "finite number" + (", not 0" if field_name == "scale" else "")
                     )
         laszip_record = _check_records(path, file, "records", records, length, begin)
         if minor >= 4 and (extended := field("I", 243)):

@@ -47,7 +47,7 @@ class RowWindows:
         # Gradients in grey values of the left image, for any exposure of the right one; the
         # disparity moves the right image against its columns: −∂R/∂x.
         x, y = (-0.5 * (_gradient(L, axis) + ratio * _gradient(R, axis)) for axis in (1, 0))
-        self.known, self.left = is_known, L
+        self.left = L
         L, R, x, y = (a * self.weight for a in (L, R, x, y))
         self.first = {"L": L, "R": R, "x": x, "y": y}
         self.second = {

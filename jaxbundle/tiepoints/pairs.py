@@ -44,9 +44,9 @@ def candidate_pairs(
     """Pairs of photographs to match.
 
     **Arguments:** `method`: `"all"`; `"sequence"`: neighbours in the order given; `"place"`: the
-    nearest by the positions in their files; `"alike"`: those whose largest features match;
-    `"auto"`: all of a few; of many the nearest if all positions are known, else those alike.
-    `place`: positions, NaN: unknown; `run`: maps a function over many.
+    nearest by the positions in their files, `"alike"` where any is unknown; `"alike"`: those whose
+    largest features match; `"auto"`: all of a few; of many as `"place"`. `place`: positions, NaN:
+    unknown; `run`: maps a function over many.
     """
     n = len(features)
     has_places = place is not None and np.isfinite(place).all()

@@ -101,7 +101,7 @@ def find_second_minima(
         superseded.append((best, inspection.vtpv))
         problem, inspection = best.problem, best.inspection
         minimum = concatenate_runs([minimum, best.minimum])
-    records = [state.record_superseded(*minimum_found) for minimum_found in superseded]
+    records = [state.record_superseded(better, vtpv) for better, vtpv in superseded]
     reported = [
         dataclasses.replace(minimum_found, taken=is_reported(minimum_found, records))
         for minimum_found in map(state.record, other_minima)

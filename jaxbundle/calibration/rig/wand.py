@@ -344,8 +344,7 @@ def _pairs(
         names = names or ["A", "B"]
         if len(names) != 2:
             raise InputError(
-                "lengths: one is given, of two markers, but the markers are "
-                f"{list_some(names)}; "
+                f"lengths: one is given, of two markers, but the markers are {list_some(names)}; "
                 'expected the length of each pair, such as {("A", "B"): 0.5}'
             )
         lengths = {(names[0], names[1]): lengths}

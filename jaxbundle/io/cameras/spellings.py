@@ -57,8 +57,7 @@ MODEL_NAMES = {
     **dict.fromkeys(
         "plumbbob rationalpolynomial rational radtan radialtangential brown brownconrady opencv "
         "pinhole perspective standard normal none opencvpinhole pinholeradtan radtan8 full "
-        "rectilinear "
-        "radialtangential8 radial".split(),
+        "rectilinear radialtangential8 radial".split(),
         "opencv",
     ),
     **dict.fromkeys(

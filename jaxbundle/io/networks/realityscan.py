@@ -333,8 +333,7 @@ def _written_interior(camera: Camera, largest_difference: float = 0.5) -> dict[s
         raise InputError(
             f"camera {camera.id!r}: RealityScan has one focal length, but fx is {p['fx']:.9g} and "
             f"fy {p['fy']:.9g}, {focal_difference:.2g} px at the edge of the image; adjust the "
-            "camera with "
-            'tie = [["fx", "fy"]]'
+            'camera with tie = [["fx", "fy"]]'
         )
     side = max(w, h)
     interior = {"f": f / side * SMALL_FORMAT[0]}

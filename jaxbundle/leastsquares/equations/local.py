@@ -80,9 +80,7 @@ def differentiate_locally(
     part = plan.parts[number]
     kind, local = declared.kinds[part.set_name], declared.kinds[part.set_name].local
     assert local is not None
-    blocks = tuple(
-        look_up(prepared[name], columns_used) for name, columns_used in zip(kind.of, part.lookup)
-    )
+    blocks = tuple(look_up(prepared[name], rows) for name, rows in zip(kind.of, part.lookup))
     measured, weight = chunked.measured[number], chunked.weight[number]
     columns_used = map_blocks(_Columns(kind), part.by_row, blocks, measured, weight)
     table, row = jnp.stack(prepared[kind.of[local.slot]], -1), part.lookup[local.slot]

@@ -80,10 +80,10 @@ def critical_w(
     return sigma0 * tau_quantile(1 - level_of_one(significance, observations) / 2, redundancy)
 
 
-def critical_length(significance: float, observations: int, residuals_each: int = 2) -> float:
+def critical_length(significance: float, vectors: int, residuals_each: int = 2) -> float:
     """Critical length of the longest of n vectors of k residuals each, in σ: t² ~ χ²ₖ; k = 2 in an
     image."""
-    level = level_of_one(significance, observations)
+    level = level_of_one(significance, vectors)
     return math.sqrt(chi2_quantile(1 - level, residuals_each))
 
 

@@ -120,10 +120,10 @@ class Ties(ObservationTable):
             sets.setdefault((first_table.name, second_table.name, name, residual), []).append(
                 (k, m, sigma[row])
             )
-        kind = lambda first_table, second_table, name, residual: Kind(
+        kind = lambda first_name, second_name, name, residual: Kind(
             "same parameters",
             residual,
-            (first_table, second_table),
+            (first_name, second_name),
             (name,),
             snooped="",
             invariant=True,

@@ -71,9 +71,7 @@ def _pack(values: np.ndarray, exact: bool = False) -> dict[str, Any]:
     if values.dtype.kind in "iu":
         low, high = (int(limit_of(initial=0)) for limit_of in (values.min, values.max))
         ranges = ((k, np.iinfo(k)) for k in INTEGERS)
-        kind = next(
-            (k for k, limit_of in ranges if limit_of.min <= low and high <= limit_of.max), "<f8"
-        )
+        kind = next((k for k, limits in ranges if limits.min <= low and high <= limits.max), "<f8")
     else:
         kind = "<f8" if exact else "<f4"
     # The page decodes little-endian bytes, whatever this machine has.
