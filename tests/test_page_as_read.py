@@ -17,9 +17,7 @@ from jaxbundle.explorer.network import NetworkView
 from jaxbundle.explorer.server import page_file
 from jaxbundle.network.tables import Camera
 from jaxbundle.plotting import views
-from jaxbundle.plotting.style import extent
-from jaxbundle.plotting.ticks import label_coordinates, label_ticks, offset_in_words
-from jaxbundle.plotting.views import (
+from jaxbundle.plotting.ellipses import (
     PERSPECTIVE,
     PLAN,
     PROBABILITY,
@@ -27,6 +25,8 @@ from jaxbundle.plotting.views import (
     choose_ellipses,
     thin_out,
 )
+from jaxbundle.plotting.style import extent
+from jaxbundle.plotting.ticks import label_coordinates, label_ticks, offset_in_words
 from jaxbundle.report.layout import coordinate_decimals, digits_of, estimate
 from jaxbundle.report.page import Addition, InputFile, Origin, compose, compose_failure, scene
 from jaxbundle.report.page.charts import Curve, draw_curves

@@ -24,8 +24,9 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.plotting import files, quality
 from jaxbundle.plotting.distortion import distortion_at
+from jaxbundle.plotting.ellipses import Ellipses, error_ellipses, principal_sections
 from jaxbundle.plotting.style import extent, round_number
-from jaxbundle.plotting.views import Ellipses, camera_pyramids, error_ellipses, principal_sections
+from jaxbundle.plotting.views import camera_pyramids
 
 matplotlib.use("Agg")
 

@@ -31,7 +31,6 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network
 from jaxbundle.io.cameras.opencv_writing import opencv_text
-from jaxbundle.io.formats import TARGETS
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
 from jaxbundle.io.networks.colmap import fill_colmap
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
@@ -39,6 +38,7 @@ from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.networks.rig_result import IN_BOARD_UNITS
 from jaxbundle.io.networks.stereo import ROS_FILES
+from jaxbundle.io.output_formats import TARGETS
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras

@@ -23,8 +23,6 @@ from jaxbundle.io.exchange import Converted as Converted
 from jaxbundle.io.exchange import convert as convert
 from jaxbundle.io.formats import FORMATS as FORMATS
 from jaxbundle.io.formats import Format as Format
-from jaxbundle.io.formats import OutputFormat as OutputFormat
-from jaxbundle.io.formats import TARGETS as TARGETS
 from jaxbundle.io.formats import read_network as read_network
 from jaxbundle.io.networks.alicevision_writing import write_alicevision as write_alicevision
 from jaxbundle.io.networks.bal import write_bal as write_bal
@@ -48,6 +46,8 @@ from jaxbundle.io.networks.pycolmap_objects import to_pycolmap as to_pycolmap
 from jaxbundle.io.networks.realityscan import write_realityscan_csv as write_realityscan_csv
 from jaxbundle.io.networks.realityscan import write_realityscan_xmp as write_realityscan_xmp
 from jaxbundle.io.networks.transforms import write_transforms as write_transforms
+from jaxbundle.io.output_formats import OutputFormat as OutputFormat
+from jaxbundle.io.output_formats import TARGETS as TARGETS
 from jaxbundle.io.rasters.correction import map_of as map_of
 from jaxbundle.io.rasters.maps import MapGrid as MapGrid
 from jaxbundle.io.rasters.maps import MapSystem as MapSystem

@@ -16,21 +16,13 @@ from jaxbundle.display import print_anywhere
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import choose_camera, is_camera_file, read_cameras
 from jaxbundle.io.cameras.nearest_camera import fit_messages
-from jaxbundle.io.formats import (
-    CAMERA_KINDS,
-    FORMATS,
-    TARGETS,
-    check_own_models,
-    has_model,
-    read_network,
-    recognise_format,
-    recognise_target,
-)
+from jaxbundle.io.formats import FORMATS, check_own_models, read_network, recognise_format
 from jaxbundle.io.networks.assemble import network_of_cameras
 from jaxbundle.io.networks.bundler import LIST
 from jaxbundle.io.networks.jaicov import COMPANION_SUFFIXES
 from jaxbundle.io.networks.losses import describe_losses, losing
 from jaxbundle.io.networks.project import FILE_NAME
+from jaxbundle.io.output_formats import CAMERA_KINDS, TARGETS, has_model, recognise_target
 from jaxbundle.io.results.coordinates import images_path
 from jaxbundle.io.writing.folders import check_folder, replace_folder
 from jaxbundle.network.columns import did_you_mean, list_some

@@ -1,11 +1,9 @@
-"""Formats: how they are recognised, and their readers and writers."""
+"""Formats of inputs: how they are recognised, and their readers."""
 
 import dataclasses
 import os
 import re
 from collections.abc import Callable, Sequence
-from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
 
 from jaxbundle.arguments import path as given_path
@@ -13,73 +11,34 @@ from jaxbundle.arguments import show, text
 from jaxbundle.cameras import CameraModel
 from jaxbundle.choices import CAMERA_INPUTS, NETWORK_FILES
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
-from jaxbundle.io.cameras.opencv_file import FILE_STORAGE, YAML
-from jaxbundle.io.cameras.opencv_file import SUFFIXES as OPENCV_SUFFIXES
-from jaxbundle.io.cameras.opencv_writing import write_opencv, write_ros
+from jaxbundle.io.cameras.camera_files import is_camera_file
+from jaxbundle.io.cameras.opencv_file import FILE_STORAGE
 from jaxbundle.io.networks.alicevision import is_alicevision, read_alicevision
-from jaxbundle.io.networks.alicevision_writing import ALICEVISION_LOSSES, write_alicevision
-from jaxbundle.io.networks.anipose import (
-    ANIPOSE_LOSSES,
-    is_anipose,
-    read_anipose,
-    write_anipose,
-)
-from jaxbundle.io.networks.bal import BAL_LOSSES, OPENERS, is_bal, read_bal, write_bal
+from jaxbundle.io.networks.anipose import is_anipose, read_anipose
+from jaxbundle.io.networks.bal import is_bal, read_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo
-from jaxbundle.io.networks.bundler import BUNDLER_LOSSES, is_bundler, read_bundler, write_bundler
-from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
-from jaxbundle.io.networks.colmap import fill_colmap, is_colmap, read_colmap, write_colmap_cameras
-from jaxbundle.io.networks.colmap_model import COLMAP_LOSSES, numbers_of
-from jaxbundle.io.networks.colmap_models import COLMAP_MODELS
+from jaxbundle.io.networks.bundler import is_bundler, read_bundler
+from jaxbundle.io.networks.colmap import is_colmap, read_colmap
 from jaxbundle.io.networks.column_map import is_column_map, read_column_map
 from jaxbundle.io.networks.control import read_control, select_checks, with_control
 from jaxbundle.io.networks.csm_frame import is_csm_frame, read_csm_frame
-from jaxbundle.io.networks.jaicov import JAICOV_LOSSES, is_jaicov, read_jaicov, write_jaicov
-from jaxbundle.io.networks.kalibr import KALIBR_LOSSES, is_kalibr, read_kalibr, write_kalibr
-from jaxbundle.io.networks.kalibr import OFFERED_MODELS as KALIBR_MODELS
-from jaxbundle.io.networks.losses import PIXEL_MODELS, QUANTITIES, Losses, changed
+from jaxbundle.io.networks.jaicov import is_jaicov, read_jaicov
+from jaxbundle.io.networks.kalibr import is_kalibr, read_kalibr
 from jaxbundle.io.networks.metashape import is_metashape, read_metashape
-from jaxbundle.io.networks.micmac import FILES as MICMAC_FILES
-from jaxbundle.io.networks.micmac import MICMAC_LOSSES, fill_micmac, is_micmac, read_micmac
-from jaxbundle.io.networks.micmac_camera import MODELS as MICMAC_MODELS
-from jaxbundle.io.networks.micmac_camera import write_autocal
+from jaxbundle.io.networks.micmac import is_micmac, read_micmac
 from jaxbundle.io.networks.mounted_files import is_euroc, is_vins, read_euroc, read_vins
-from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
-from jaxbundle.io.networks.mrcal import (
-    MRCAL_LOSSES,
-    fill_mrcal,
-    is_mrcal,
-    read_mrcal,
-    write_cameramodel,
-)
-from jaxbundle.io.networks.mrcal import OFFERED_MODELS as MRCAL_MODELS
+from jaxbundle.io.networks.mrcal import is_mrcal, read_mrcal
 from jaxbundle.io.networks.nvm import is_nvm, read_nvm
 from jaxbundle.io.networks.opencv_rigs import is_opencv_rig, read_opencv_rig
-from jaxbundle.io.networks.openmvg import OPENMVG_LOSSES, is_openmvg, read_openmvg, write_openmvg
-from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
-from jaxbundle.io.networks.opensfm import (
-    OPENSFM_LOSSES,
-    fill_opensfm,
-    is_opensfm,
-    read_opensfm,
-    write_opensfm_cameras,
-)
+from jaxbundle.io.networks.openmvg import is_openmvg, read_openmvg
+from jaxbundle.io.networks.opensfm import is_opensfm, read_opensfm
 from jaxbundle.io.networks.opensfm_control import CONTROL
 from jaxbundle.io.networks.opf import is_opf, read_opf
 from jaxbundle.io.networks.orb_slam import is_orb_slam_pair, read_orb_slam_pair
 from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
-from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
-from jaxbundle.io.networks.project import FILES as PROJECT_FILES
-from jaxbundle.io.networks.realityscan import FILES as REALITYSCAN_FILES
-from jaxbundle.io.networks.realityscan import (
-    REALITYSCAN_LOSSES,
-    fill_realityscan,
-    is_realityscan,
-    read_realityscan,
-    write_realityscan_csv,
-)
+from jaxbundle.io.networks.project import project_file, read_project
+from jaxbundle.io.networks.realityscan import is_realityscan, read_realityscan
 from jaxbundle.io.networks.rig_result import (
     file_of_line,
     is_rig_line,
@@ -88,28 +47,12 @@ from jaxbundle.io.networks.rig_result import (
     read_rig_result,
 )
 from jaxbundle.io.networks.settings import choose_datum
-from jaxbundle.io.networks.stereo import (
-    ROS_FILES,
-    STEREO_LOSSES,
-    fill_ros_stereo,
-    is_ros_stereo,
-    opencv_stereo_files,
-    read_ros_stereo,
-    ros_stereo_folders,
-    write_opencv_stereo,
-)
-from jaxbundle.io.networks.transforms import (
-    TRANSFORMS_LOSSES,
-    is_transforms,
-    read_transforms,
-    write_transforms,
-)
-from jaxbundle.io.results.coordinates import COORDINATES_LOSSES, write_coordinates
-from jaxbundle.io.results.dxf import DXF_LOSSES, write_dxf
-from jaxbundle.io.results.ply import PLY_LOSSES, write_ply
+from jaxbundle.io.networks.stereo import is_ros_stereo, read_ros_stereo
+from jaxbundle.io.networks.transforms import is_transforms, read_transforms
+from jaxbundle.io.output_formats import TARGETS
 from jaxbundle.network.columns import count, did_you_mean, list_some
 from jaxbundle.network.rules import check_unique, model_of
-from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.network.tables import Network, Source
 from jaxbundle.system.file_content import beginning, is_plain
 
 
@@ -127,52 +70,6 @@ class Format:
     names_models: bool = False
     takes_image_size: bool = False
     unread: tuple[str, ...] = ()
-
-
-@dataclasses.dataclass(frozen=True)
-class OutputFormat:
-    """A kind of output: how its names are recognised, its writer, and its camera models.
-
-    `write` returns messages about what is not kept: `losses`, and what only the writer sees; no
-    `models`: all, a name with * is a family.
-    `files`: names of the files in a folder; none: a file is written. `alone`: cameras
-    without images can be written. `parts`: the files or folders that are written of a network, if
-    there may be several.
-    """
-
-    recognises: Callable[[Path], bool]
-    write: Callable[[Network, Path], Sequence[str]]
-    looks: str
-    models: tuple[str, ...] = ()
-    files: tuple[str, ...] = ()
-    alone: bool = False
-    losses: Losses = dataclasses.field(default_factory=dict)
-    parts: Callable[[Network, Path], tuple[Path, ...]] | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class CameraTarget:
-    """A kind of output that holds cameras only: as `OutputFormat`; `single`: one camera; `broad`:
-    the name also fits other kinds, which come first."""
-
-    recognises: Callable[[Path], bool]
-    write: Callable[[Sequence[Camera], Path], None]
-    looks: str
-    models: tuple[str, ...] = ()
-    single: bool = False
-    broad: bool = False
-    losses: Losses = dataclasses.field(default_factory=dict)
-
-
-def _camera_losses(names: Callable[[Sequence[str]], Sequence[object]] | None = None) -> Losses:
-    """The losses of a file of cameras; `names`: those that they get."""
-    quantities = ("pixel sizes of cameras", "prior σ of camera parameters")
-    name_losses: Losses = {}
-    if names is not None:
-        name_losses = {
-            "names of cameras": lambda n: changed(ids := [c.id for c in n.cameras], names(ids))
-        }
-    return name_losses | {name: QUANTITIES[name] for name in quantities}
 
 
 def _is_project(path: Path) -> bool:
@@ -283,265 +180,6 @@ FORMATS: dict[str, Format] = {
     ),
     "opf": Format(is_opf, read_opf, NETWORK_FILES["opf"]),
 }
-
-
-def _write_project(network: Network, path: Path) -> Sequence[str]:
-    fill_project(network, path)
-    return ()
-
-
-def _has_suffix(*suffixes: str) -> Callable[[Path], bool]:
-    return lambda path: path.suffix.lower() in suffixes
-
-
-def _folder_contains(*words: str) -> Callable[[Path], bool]:
-    """A name without suffix that contains one of these words, or whose folder does."""
-    return lambda path: (
-        not path.suffix and any(word in part.lower() for part in path.parts[-2:] for word in words)
-    )
-
-
-def _file_contains(word: str, *suffixes: str) -> Callable[[Path], bool]:
-    return lambda path: word in path.stem.lower() and path.suffix.lower() in suffixes
-
-
-def _has_name(name: str) -> Callable[[Path], bool]:
-    return lambda path: path.name.lower() == name
-
-
-def _single_camera_writer(
-    write: Callable[[Camera, Path], None],
-) -> Callable[[Sequence[Camera], Path], None]:
-    """Writes the only camera."""
-    return lambda cameras, path: write(cameras[0], path)
-
-
-# The order is that of recognition; "project" takes any folder and stands last.
-TARGETS: dict[str, OutputFormat] = {
-    "ply": OutputFormat(
-        _has_suffix(".ply"),
-        write_ply,
-        "NAME.ply",
-        losses=PLY_LOSSES,
-    ),
-    "dxf": OutputFormat(
-        _has_suffix(".dxf"),
-        write_dxf,
-        "NAME.dxf",
-        losses=DXF_LOSSES,
-    ),
-    "realityscan-csv": OutputFormat(
-        _file_contains("realityscan", ".csv"),
-        write_realityscan_csv,
-        "NAME.csv with realityscan in its name",
-        ("opencv",),
-        losses=REALITYSCAN_LOSSES,
-    ),
-    "csv": OutputFormat(
-        _has_suffix(".csv"),
-        write_coordinates,
-        "NAME.csv",
-        losses=COORDINATES_LOSSES,
-    ),
-    "bundler": OutputFormat(
-        _has_suffix(".out"),
-        write_bundler,
-        "NAME.out",
-        ("snavely",),
-        losses=BUNDLER_LOSSES,
-    ),
-    "bal": OutputFormat(
-        _has_suffix(".txt", ".bal", *OPENERS),
-        write_bal,
-        "NAME.txt, .bal, .gz, .bz2",
-        ("snavely",),
-        losses=BAL_LOSSES,
-    ),
-    "colmap": OutputFormat(
-        _folder_contains("colmap", "sparse"),
-        partial(fill_colmap, text=False),
-        "a folder with colmap or sparse in its name",
-        COLMAP_MODELS,
-        COLMAP_FILES,
-        losses=COLMAP_LOSSES,
-    ),
-    "colmap-text": OutputFormat(
-        lambda _: False,  # a folder is named as for "colmap": only --to asks for text
-        partial(fill_colmap, text=True),
-        "by --to only",
-        COLMAP_MODELS,
-        COLMAP_FILES,
-        losses=COLMAP_LOSSES,
-    ),
-    "openmvg": OutputFormat(
-        _file_contains("sfm_data", ".json"),
-        write_openmvg,
-        "NAME.json with sfm_data in its name",
-        PIXEL_MODELS,
-        losses=OPENMVG_LOSSES,
-    ),
-    "opensfm": OutputFormat(
-        _folder_contains("opensfm"),
-        fill_opensfm,
-        "a folder with opensfm in its name",
-        PIXEL_MODELS,
-        OPENSFM_FILES,
-        losses=OPENSFM_LOSSES,
-    ),
-    "alicevision": OutputFormat(
-        _has_suffix(".sfm"),
-        write_alicevision,
-        "NAME.sfm",
-        PIXEL_MODELS,
-        losses=ALICEVISION_LOSSES,
-    ),
-    "transforms": OutputFormat(
-        _file_contains("transforms", ".json"),
-        write_transforms,
-        "NAME.json with transforms in its name",
-        PIXEL_MODELS,
-        alone=True,
-        losses=TRANSFORMS_LOSSES,
-    ),
-    "kalibr": OutputFormat(
-        _file_contains("camchain", *YAML),
-        write_kalibr,
-        "NAME.yaml with camchain in its name",
-        KALIBR_MODELS,
-        alone=True,
-        losses=KALIBR_LOSSES,
-    ),
-    "micmac": OutputFormat(
-        lambda path: path.name.startswith("Ori-"),
-        fill_micmac,
-        "a folder Ori-NAME",
-        MICMAC_MODELS,
-        MICMAC_FILES,
-        losses=MICMAC_LOSSES,
-    ),
-    "jaicov": OutputFormat(
-        _has_suffix(".phc"),
-        write_jaicov,
-        "NAME.phc",
-        ("brown-projected",),
-        losses=JAICOV_LOSSES,
-    ),
-    "mrcal": OutputFormat(
-        _folder_contains("mrcal"),
-        fill_mrcal,
-        "a folder with mrcal in its name",
-        MRCAL_MODELS,
-        MRCAL_FILES,
-        alone=True,
-        losses=MRCAL_LOSSES,
-    ),
-    "opencv-stereo": OutputFormat(
-        _file_contains("stereo", *OPENCV_SUFFIXES),
-        write_opencv_stereo,
-        "NAME.yaml, .yml, .json with stereo in its name",
-        PIXEL_MODELS,
-        losses=STEREO_LOSSES,
-        parts=opencv_stereo_files,
-    ),
-    "ros-stereo": OutputFormat(
-        _folder_contains("camera_info"),
-        fill_ros_stereo,
-        "a folder with camera_info in its name",
-        PIXEL_MODELS,
-        ROS_FILES,
-        losses=STEREO_LOSSES,
-        parts=ros_stereo_folders,
-    ),
-    "anipose": OutputFormat(
-        _file_contains("calibration", ".toml"),
-        write_anipose,
-        "NAME.toml with calibration in its name",
-        PIXEL_MODELS,
-        alone=True,
-        losses=ANIPOSE_LOSSES,
-    ),
-    "realityscan": OutputFormat(
-        _folder_contains("realityscan"),
-        fill_realityscan,
-        "a folder with realityscan in its name",
-        ("opencv",),
-        REALITYSCAN_FILES,
-        losses=REALITYSCAN_LOSSES,
-    ),
-    "project": OutputFormat(
-        lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME,
-        _write_project,
-        "another folder",
-        files=PROJECT_FILES,
-    ),
-}
-# Outputs that hold cameras only.
-CAMERA_KINDS: dict[str, CameraTarget] = {
-    "colmap-cameras": CameraTarget(
-        _has_name("cameras.txt"),
-        write_colmap_cameras,
-        "cameras.txt",
-        COLMAP_MODELS,
-        losses=_camera_losses(numbers_of),
-    ),
-    "opensfm-cameras": CameraTarget(
-        _has_name("camera_models.json"),
-        write_opensfm_cameras,
-        "camera_models.json",
-        PIXEL_MODELS,
-        losses=_camera_losses(),
-    ),
-    "ros": CameraTarget(
-        _file_contains("camera_info", *YAML),
-        _single_camera_writer(write_ros),
-        "NAME.yaml with camera_info in its name",
-        PIXEL_MODELS,
-        single=True,
-        losses=_camera_losses(lambda ids: [None] * len(ids)),
-    ),
-    "cameramodel": CameraTarget(
-        _has_suffix(".cameramodel"),
-        _single_camera_writer(write_cameramodel),
-        "NAME.cameramodel",
-        MRCAL_MODELS,
-        single=True,
-        losses=_camera_losses(lambda ids: [None] * len(ids)),
-    ),
-    "autocal": CameraTarget(
-        _file_contains("autocal", ".xml"),
-        _single_camera_writer(write_autocal),
-        "NAME.xml with autocal in its name",
-        MICMAC_MODELS,
-        single=True,
-        losses=_camera_losses(lambda ids: [None] * len(ids)),
-    ),
-    "opencv": CameraTarget(
-        _has_suffix(*YAML, ".json"),
-        _single_camera_writer(write_opencv),
-        "NAME.yaml, .yml, .json",
-        PIXEL_MODELS,
-        single=True,
-        losses=_camera_losses(lambda ids: [None] * len(ids)),
-        broad=True,
-    ),
-    "cameras": CameraTarget(_has_suffix(".toml"), write_cameras, "NAME.toml", broad=True),
-}
-
-
-def has_model(models: Sequence[str], model: str | CameraModel) -> bool:
-    """Whether a kind of output has a model; an empty list means all."""
-    return not models or any(isinstance(model, str) and fnmatchcase(model, m) for m in models)
-
-
-def recognise_target(path: Path) -> str | None:
-    """The kind of an output, from its name."""
-    kinds = (
-        # The narrow names of cameras first, the broad ones after the networks.
-        *((name, kind) for name, kind in CAMERA_KINDS.items() if not kind.broad),
-        *TARGETS.items(),
-        *CAMERA_KINDS.items(),
-    )
-    return next((name for name, kind in kinds if kind.recognises(path)), None)
 
 
 def recognise_format(path: Path) -> str | None:

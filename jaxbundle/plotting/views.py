@@ -1,18 +1,27 @@
 """The network as a map and in perspective: points by role, cameras as pyramids, error ellipses."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxbundle.cameras import get_model, image_ray
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.plotting.ellipses import (
+    PERSPECTIVE,
+    PLAN,
+    PROBABILITY,
+    Ellipses,
+    choose_ellipses,
+    error_ellipses,
+    median_neighbour,
+    principal_sections,
+)
 from jaxbundle.plotting.frame import image_frame, pyramid_lines
 from jaxbundle.plotting.style import (
     BLUE,
@@ -28,7 +37,6 @@ from jaxbundle.plotting.style import (
     plain,
     quiet,
     quiet_3d,
-    round_number,
     title,
 )
 from jaxbundle.plotting.ticks import label_coordinates
@@ -42,38 +50,6 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.result import Adjustment
 
 
-@dataclass(frozen=True)
-class EllipseSettings:
-    """Which error ellipses of points are drawn, and how large.
-
-    **Fields:**
-
-    - `dimensions`: 2 for ellipses of X and Y, 3 for ellipsoids.
-    - `largest`, `sampled`: of more points than these together, the largest ones, and at most so
-      many others, spread evenly. An image of 1000 pixels has room for about 300 ellipses that can
-      be told apart.
-    - `smallest`, `widest`: limits of the median largest half-axis, as parts of the size of the
-      network: longer than the mark of its point, and not so long that neighbours lie across each
-      other.
-    - `longest`: points with a longer half-axis are marked, and their ellipses not drawn: a few of
-      poorly determined points would cover the network. Of a tenth, the whole ellipse is a fifth of
-      the drawing.
-    """
-
-    dimensions: int = 2
-    largest: int = 20
-    sampled: int = 280
-    smallest: float = 0.012
-    widest: float = 0.03
-    longest: float = 0.1
-
-
-PLAN = EllipseSettings()
-# Sections of an ellipsoid are three ellipses, and points behind each other share their place in the
-# picture: a fifth as many. None is hidden by the mark of its own point.
-PERSPECTIVE = EllipseSettings(3, 10, 50, 0.02, 0.06)
-# A drawing that can be turned and enlarged.
-SCENE = EllipseSettings(3)
 # Points whose ellipses are too wide to be drawn.
 TOO_WIDE = {
     "s": 16,
@@ -83,9 +59,6 @@ TOO_WIDE = {
     "linewidths": 0.6,
     "label": "ellipse too wide to be drawn",
 }
-# Probability that a normally distributed error of 2 or 3 coordinates is inside its 1σ ellipse or
-# ellipsoid: 1 − exp(−1/2), and erf(√½) − √(2/π)·exp(−1/2).
-PROBABILITY = {2: "39 %", 3: "20 %"}
 
 
 def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
@@ -280,17 +253,7 @@ def _corner_rays(
 
 def pyramid_size(centres: Float[np.ndarray, "n 3"], size: float) -> float:
     """A visible size that keeps neighbours apart."""
-    return float(np.clip(0.9 * _neighbour(centres), 0.045 * size, 0.15 * size))
-
-
-def _neighbour(places: Float[np.ndarray, "n d"], max_sample: int = 400) -> float:
-    """The median distance to the nearest neighbour, from a sample; infinite for a single place."""
-    if len(places) < 2:
-        return np.inf
-    sample = places[:: max(1, len(places) // max_sample)]
-    distances = np.linalg.norm(sample[:, None] - places[None], axis=2)
-    distances[distances == 0] = np.inf
-    return float(np.median(distances.min(1)))
+    return float(np.clip(0.9 * median_neighbour(centres), 0.045 * size, 0.15 * size))
 
 
 # --- points ---------------------------------------------------------------------------------
@@ -332,126 +295,6 @@ def _behind_ellipsoids(role: str, number: int, ellipses: "Ellipses") -> dict[str
 
 # Left, right, low, top of a text, pixels.
 Box = tuple[float, float, float, float]
-
-
-class Ellipses(NamedTuple):
-    """Error ellipses to draw: the rows of their points, the number of points that have one, and the
-    factor of their exaggeration; the rows of points whose ellipses are too wide, and how many of
-    the rows are the largest of the others."""
-
-    rows: Int[np.ndarray, " drawn"]
-    total: int
-    factor: float
-    wide: Int[np.ndarray, " wide"] = np.zeros(0, int)
-    largest: int = 0
-
-    @property
-    def exaggeration(self) -> str:
-        """The factor in words."""
-        return f"× {self.factor:,.12g}".replace(",", " ")
-
-    @property
-    def selection(self) -> str:
-        """Which ones are drawn if there are more."""
-        number_drawn, wide = len(self.rows), len(self.wide)
-        if number_drawn == self.total:
-            return ""
-        words = f"of {number_drawn} of {self.total} points"
-        if wide:
-            words += f" (too wide to be drawn: {wide})"
-        if number_drawn + wide < self.total:
-            rest_in_words = " of the rest" if wide else ""
-            others = number_drawn - self.largest
-            words += f": the {self.largest} largest{rest_in_words} and {others} others"
-        return words
-
-
-def choose_ellipses(adjustment: "Adjustment", size: float, settings: EllipseSettings) -> Ellipses:
-    """The error ellipses of points for a network of this size, in a visible and comparable size: a
-    half-axis of half the median distance of neighbours, within the limits of the `settings`."""
-    dimensions = settings.dimensions
-    covariance = adjustment.point_covariance[:, :dimensions, :dimensions]
-    is_known = np.isfinite(covariance).all((1, 2))
-    half_axis = np.zeros(len(covariance))
-    half_axis[is_known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[is_known])[:, -1], 0))
-    candidate_rows = np.flatnonzero(adjustment.located & (half_axis > 0))
-    if not len(candidate_rows):
-        return Ellipses(candidate_rows, 0, 1.0)
-    places, half_axis = adjustment.point_values[candidate_rows], half_axis[candidate_rows]
-    rows = thin_out(places, half_axis, size, settings)
-    neighbour = _neighbour(places[rows, :dimensions])
-    reach = np.clip(0.45 * neighbour, settings.smallest * size, settings.widest * size)
-    longest = settings.longest * size
-    # One in twenty at most is too wide.
-    middle, large_axis = np.quantile(half_axis, [0.5, 0.95], method="lower")
-    factor = round_number(min(reach / middle, longest / large_axis))
-    wide = factor * half_axis > longest
-    usual_rows = np.flatnonzero(~wide)
-    rows = usual_rows[thin_out(places[usual_rows], half_axis[usual_rows], size, settings)]
-    largest = settings.largest if len(rows) < len(usual_rows) else 0
-    return Ellipses(
-        candidate_rows[rows], len(candidate_rows), factor, candidate_rows[wide], largest
-    )
-
-
-def thin_out(
-    xyz: Float[np.ndarray, "n 3"],
-    large: Float[np.ndarray, " n"],
-    size: float,
-    settings: EllipseSettings,
-) -> Int[np.ndarray, " drawn"]:
-    """The rows to draw, ascending: all if they are few, else the largest, and of the others the
-    first in each cell of a grid across the two wider axes, whose cells have room for an ellipse of
-    a network of this `size`."""
-    if len(large) <= settings.largest + settings.sampled:
-        return np.arange(len(large))
-    largest_rows, other_rows = np.split(np.argsort(-large, kind="stable"), [settings.largest])
-    other_rows = np.sort(other_rows)
-    low, high = np.quantile(xyz, [0.01, 0.99], axis=0)
-    wide = np.argsort(low - high)[:2]
-    sides = np.maximum((high - low)[wide], 1e-12 * max(float((high - low).max()), 1e-300))
-    # Two half-axes, and half of one between neighbours; along a line cells are as many as ellipses.
-    room = 2.5 * settings.smallest * size
-    sampled = np.clip(np.prod(np.maximum(sides / room, 1)), 1, settings.sampled)
-    cells = np.maximum(np.sqrt(sampled * sides / sides[::-1]).astype(int), 1)
-    cells = np.minimum(cells, int(sampled))
-    cell = np.clip((xyz[other_rows][:, wide] - low[wide]) / sides * cells, 0, cells - 1).astype(int)
-    _, sample = np.unique(cell[:, 0] * cells[1] + cell[:, 1], return_index=True)
-    return np.sort(np.concatenate([largest_rows, other_rows[sample[: settings.sampled]]]))
-
-
-def error_ellipses(adjustment: "Adjustment", ellipses: Ellipses, corners: int = 49) -> np.ndarray:
-    """Closed polygons [drawn, corners, 2] of ellipses of X and Y."""
-    half_axes = _half_axes(adjustment, ellipses, 2)
-    offsets = half_axes @ _circle(corners)
-    return adjustment.point_values[ellipses.rows, None, :2] + offsets.transpose(0, 2, 1)
-
-
-def principal_sections(
-    adjustment: "Adjustment", ellipses: Ellipses, corners: int = 33
-) -> np.ndarray:
-    """Closed polygons [3·drawn, corners, 3]: the sections of error ellipsoids by the planes of two
-    of their axes."""
-    half_axes = _half_axes(adjustment, ellipses, 3)
-    offsets = np.stack(
-        [half_axes[:, :, pair] @ _circle(corners) for pair in ([0, 1], [0, 2], [1, 2])]
-    )
-    sections = adjustment.point_values[ellipses.rows, None] + offsets.transpose(0, 1, 3, 2)
-    return sections.reshape(-1, corners, 3)
-
-
-def _half_axes(
-    adjustment: "Adjustment", ellipses: Ellipses, dimensions: int
-) -> Float[np.ndarray, "drawn d d"]:
-    """The exaggerated half-axes of the first coordinates' ellipses, as columns."""
-    covariance = adjustment.point_covariance[ellipses.rows, :dimensions, :dimensions]
-    square, direction = np.linalg.eigh(0.5 * (covariance + covariance.transpose(0, 2, 1)))
-    return ellipses.factor * direction * np.sqrt(np.clip(square, 0, None))[:, None, :]
-
-
-def _circle(corners: int) -> Float[np.ndarray, "2 corners"]:
-    t = np.linspace(0, 2 * np.pi, corners)
-    return np.stack([np.cos(t), np.sin(t)])
 
 
 def _draw_ellipses(adjustment: "Adjustment", ax: "Axes", size: float) -> tuple[np.ndarray, str]:

@@ -15,8 +15,9 @@ from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.geometry.rotations import omega_phi_kappa_from_matrix
 from jaxbundle.io import read_network
-from jaxbundle.io.formats import FORMATS, TARGETS
+from jaxbundle.io.formats import FORMATS
 from jaxbundle.io.networks.losses import PARTS, QUANTITIES
+from jaxbundle.io.output_formats import TARGETS
 from jaxbundle.network import Camera
 from jaxbundle.network.build import make_network
 from jaxbundle.network.kinds import KINDS as KINDS

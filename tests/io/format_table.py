@@ -28,7 +28,8 @@ import jaxbundle.io.networks
 import jaxbundle.io.scanner
 from jaxbundle.errors import InputError
 from jaxbundle.io import convert, read_network, write_project
-from jaxbundle.io.formats import CAMERA_KINDS, FORMATS, TARGETS
+from jaxbundle.io.formats import FORMATS
+from jaxbundle.io.output_formats import CAMERA_KINDS, TARGETS
 from jaxbundle.io.text.known_keys import Keys
 from jaxbundle.network.tables import Network
 

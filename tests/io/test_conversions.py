@@ -14,8 +14,9 @@ import yaml
 from conversions import DRAWINGS, HOLDS, PAGE, full_network, holds, model_for, round_trip, write
 from test_hostile_files import KINDS, made, read
 
-from jaxbundle.io.formats import CAMERA_KINDS, FORMATS, TARGETS
+from jaxbundle.io.formats import FORMATS
 from jaxbundle.io.networks.losses import QUANTITIES, describe_losses
+from jaxbundle.io.output_formats import CAMERA_KINDS, TARGETS
 from jaxbundle.network.tables import Network
 
 READ = [kind for kind in TARGETS if kind not in DRAWINGS]

@@ -13,13 +13,14 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
-from jaxbundle.io.formats import TARGETS, recognise_format, recognise_target
+from jaxbundle.io.formats import recognise_format
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.realityscan import (
     _heading_of,
     _rotation_from_heading,
     write_realityscan_csv,
 )
+from jaxbundle.io.output_formats import TARGETS, recognise_target
 
 F, U, V, K = 24.4, -4.6e-4, -8.2e-4, (-0.12, 0.107, -0.0105, 0.0, 0.0, 0.0)
 SIZE = (1280, 720)

@@ -130,7 +130,7 @@ def test_coefficients_that_kalibr_lacks_are_fitted_and_said(tmp_path):
 
 def convert_network(net, path):
     """As `convert` writes it."""
-    from jaxbundle.io.formats import TARGETS, recognise_target
+    from jaxbundle.io.output_formats import TARGETS, recognise_target
 
     TARGETS[recognise_target(path)].write(net, path)
     return path

@@ -102,8 +102,8 @@ def rounding_warnings(
         }
         large_effects = {name: effect for name, effect in effects.items() if effect > max_effect}
         if large_effects:
-            effects = (f"{name} to {effect:.2g} px" for name, effect in large_effects.items())
-            effects_text = list_some(effects, as_text=str)
+            in_words = (f"{name} to {effect:.2g} px" for name, effect in large_effects.items())
+            effects_text = list_some(in_words, as_text=str)
             warnings.append(
                 f"the file rounds camera {camera.id!r}: in the corner of the image this leaves "
                 f"open {effects_text}; give more digits (--set "

@@ -6,16 +6,10 @@ import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.plotting.distortion import principal_point
+from jaxbundle.plotting.ellipses import PROBABILITY, SCENE, choose_ellipses, thin_out
 from jaxbundle.plotting.frame import image_frame
 from jaxbundle.plotting.style import extent, micrometres, round_number
-from jaxbundle.plotting.views import (
-    PROBABILITY,
-    SCENE,
-    camera_pyramids,
-    choose_ellipses,
-    pyramid_size,
-    thin_out,
-)
+from jaxbundle.plotting.views import camera_pyramids, pyramid_size
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page.columns import encode_values
 
