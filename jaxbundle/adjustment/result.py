@@ -590,6 +590,12 @@ class Adjustment:
         return None if self.error_model is None else self.camera_covariance(camera)[1]
 
     @property
+    def image_rms(self) -> float:
+        """The RMS of the residuals of image coordinates, in the image unit; NaN without any."""
+        v = result_tables.image_residuals(self)[self.problem.used_coordinates]
+        return float(np.sqrt(np.mean(v**2))) if v.size else float("nan")
+
+    @property
     def sigma_ratio(self) -> float:
         """The median of σ under the error model over classical σ, of the interior orientations or
         of the exterior ones, whichever is larger: control determines only the latter. 1 without a

@@ -148,12 +148,17 @@ def units(adjustment: "Adjustment", columns: Sequence[str], name: str) -> dict[s
     return {column: unit for column in columns if (unit := unit_of_column(column))}
 
 
+def image_residuals(adjustment: "Adjustment") -> Float[np.ndarray, "rays 2"]:
+    """v of all image coordinates, in the image unit; of no meaning where they are not used."""
+    weight, has_weight = adjustment.problem.image_weights, adjustment.problem.used_coordinates
+    return adjustment.inspection.image_residuals / np.where(has_weight, weight, 1.0)
+
+
 def _rays_and_rms(
     adjustment: "Adjustment", of_ray: Int[np.ndarray, " rays"], n: int
 ) -> dict[str, np.ndarray]:
     """Columns rays and rms (of v, image unit) by the index `of_ray` of every ray."""
-    weight, has_weight = adjustment.problem.image_weights, adjustment.problem.used_coordinates
-    v = adjustment.inspection.image_residuals / np.where(has_weight, weight, 1.0)
+    has_weight, v = adjustment.problem.used_coordinates, image_residuals(adjustment)
     squares = np.bincount(of_ray, (v**2 * has_weight).sum(1), minlength=n)
     number = np.bincount(of_ray, has_weight.sum(1), minlength=n)
     return {

@@ -83,7 +83,7 @@ class BlockFacts:
             ("Coordinate system", self.system),
             (
                 "Ground sample distance",
-                f"{significant(self.ground_sample_distance)} {self.unit} a pixel, median",
+                f"{significant(self.ground_sample_distance)} {self.unit} per pixel, median",
             ),
             ("Distance to the object", f"{significant(self.object_distance)} {self.unit}, median"),
         ]
@@ -93,8 +93,8 @@ class BlockFacts:
         if self.area is not None:
             rows.append(("Area covered", f"{significant(self.area)} {area}, of the tie points"))
         overlap = (
-            f"{self.rays_per_point:.1f} rays a tie point, "
-            f"{self.points_per_photograph:.0f} tie points a photograph"
+            f"{self.rays_per_point:.1f} rays per tie point, "
+            f"{self.points_per_photograph:.0f} tie points per photograph"
         )
         if self.photographs_per_place is not None:
             overlap += f", each place in {self.photographs_per_place:.1f} photographs"

@@ -165,12 +165,12 @@ def assign_cameras(
             if stated_distance
             else "unknown: found from the photographs"
         )
-        same_lens = f", the lens of camera {cameras[lens.index(lens[number])].id}" * (
+        same_lens = f", the lens of camera {cameras[lens.index(lens[number])].id!r}" * (
             lens[number] in lens[:number]
         )
         notes = (
             *notes,
-            f"camera {id}: {count(len(rows), 'photograph')} of {exif.size[0]} × "
+            f"camera {id!r}: {count(len(rows), 'photograph')} of {exif.size[0]} × "
             f"{exif.size[1]} pixels, principal distance {where}{same_lens}",
         )
     return Cameras(
@@ -188,7 +188,7 @@ def _fit_size(given_camera: Camera, photographs: Sequence[Photograph]) -> Camera
         if tuple(size) != photograph.size:
             raise InputError(
                 f"{photograph.path}: {photograph.size[0]} × {photograph.size[1]} pixels, but "
-                f"camera {given_camera.id} has {size[0]} × {size[1]}"
+                f"camera {given_camera.id!r} has {size[0]} × {size[1]}"
             )
     return given_camera
 

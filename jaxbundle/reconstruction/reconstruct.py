@@ -568,7 +568,7 @@ class _ReconstructionRun:
             deviation = abs(adjusted["value"] - file.value)
             if deviation > square_pixels.CRITICAL_DEVIATION * sigma:
                 messages.append(
-                    f"camera {id}: principal distance {adjusted['value']:.0f} px contradicts the "
+                    f"camera {id!r}: principal distance {adjusted['value']:.0f} px contradicts the "
                     f"{file.value:.0f} ± {file.sigma:.0f} px of the files ({file.source}): the "
                     "photographs were cropped or zoomed, or the result is wrong"
                 )
@@ -622,7 +622,7 @@ class _ReconstructionRun:
         released = {}
         for id, ratio in contradicted.items():
             ratios_of_halves = halves.get(id)
-            message = f"camera {id}: the photographs alone give fy/fx {_ratio_in_words(ratio)}, "
+            message = f"camera {id!r}: the photographs alone give fy/fx {_ratio_in_words(ratio)}, "
             if ratios_of_halves is None:
                 message += "halves of them none: "
             else:

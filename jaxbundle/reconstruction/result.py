@@ -15,6 +15,7 @@ from jaxbundle.reconstruction.block import BlockFacts
 from jaxbundle.reconstruction.control_table import ControlTable
 from jaxbundle.report.correlated import first_facts, stated_sigma_of
 from jaxbundle.report.head import count_points
+from jaxbundle.report.layout import significant
 from jaxbundle.results import TableMethods
 
 
@@ -115,6 +116,7 @@ class Reconstruction(TableMethods):
         lines += [
             f"{self.prefix(part)}{count(len(part.adjustment.network.images), 'photograph')}, "
             f"{count(count_points(part.adjustment), 'point')}, "
+            f"RMS of image residuals {significant(part.adjustment.image_rms, 2)} px, "
             f"σ0 {part.adjustment.sigma0:.3f}{distances_found(part.adjustment)}"
             for part in self.parts
         ]

@@ -36,7 +36,7 @@ REPLICATION_LEGEND = (
     "to photographs, and all halves the errors of given coordinates, such as those of a bent "
     "board: they cannot show these errors."
 )
-DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in it")
+DIFFERENCE_HEADER = ("parameter", "difference", "σ", "in σ", "σ correlated", "in σ correlated")
 FIELD = "field on the sensor"
 # What a component says about camera or measurement, with its size, and what can be done about it.
 REMARKS = {
@@ -45,7 +45,7 @@ REMARKS = {
     "principal distance by photograph": "the principal distance changes between photographs, by {} "
     "at the edge of the image: keep focus and zoom fixed",
     "affine by photograph": "shear and ratio of scales change between photographs, by {} at the "
-    "edge of the image: a moving shutter, or film that is not flat",
+    "edge of the image: a rolling shutter, or film that is not flat",
     "along tracks": "errors of {} along the tracks of points, similar from neighbouring stations: "
     "measured against one image",
     "given points in plane": "given points, such as those of a board, are displaced in its "
@@ -92,8 +92,9 @@ def first_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
         rows.append(
             (
                 "σ shown",
-                f"under correlated errors {significant(adjustment.sigma_ratio, 3)} times the "
-                "classical ones (median of the orientations); the larger of both is shown",
+                "the larger of the classical one and that under correlated errors, which is "
+                f"{significant(adjustment.sigma_ratio, 3)} times the classical one (median of the "
+                "orientations)",
             )
         )
     elif adjustment.assumes_independence:

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.leastsquares.quality.global_test import describe_test
@@ -89,7 +90,10 @@ def title(adjustment: "Adjustment", date: str | None) -> list[str]:
 
 def settings(adjustment: "Adjustment", verdict: "Verdict | None" = None) -> list[str]:
     """What to know first; method, datum, domain of the residuals, units."""
-    return ["", *facts([*first_facts(adjustment, verdict), *setting_facts(adjustment)])]
+    rows = first_facts(adjustment, verdict)
+    if adjustment.converged:
+        rows.append(("RMS residual", image_residuals_in_words(adjustment)))
+    return ["", *facts([*rows, *setting_facts(adjustment)])]
 
 
 def first_facts(
@@ -106,9 +110,14 @@ def first_facts(
     left_out = left_out_in_words(adjustment)
     facts_said = [f"{left_out}: see Notes, and left_out in the JSON"] if left_out else []
     if removals := adjustment.removed:
-        words = count(sum(len(item.rows) for item in removals), "observation")
+        number: Counter[str] = Counter()
+        for item in removals:
+            number["image point" if item.kind == "image" else "other observation"] += len(item.rows)
+        words = ", ".join(count(n, noun) for noun, n in number.items())
+        if excluded := int(adjustment.problem.excluded.sum()):
+            words += f" and with them {count(excluded, 'object point')}"
         facts_said.append(f'{words} by data snooping: see there, and "removed" in the JSON')
-    return [*rows, ("Left out", "; ".join(facts_said))] if facts_said else rows
+    return [*rows, *([("Left out", "; ".join(facts_said))] if facts_said else [])]
 
 
 def left_out_in_words(adjustment: "Adjustment") -> str:
@@ -284,12 +293,17 @@ def convergence(adjustment: "Adjustment") -> list[str]:
             f"Ended after {count(adjustment.iterations, 'iteration')}, {adjustment.termination}."
         ),
     ]
-    if adjustment.removed or adjustment.eliminated or adjustment.sigma_factors:
+    if is_last_of_several(adjustment):
         lines += paragraph(
             "This is the last of several adjustments, each started from the result of the previous "
             "one, after observations or parameters were removed or σ estimated (see below)."
         )
     return lines
+
+
+def is_last_of_several(adjustment: "Adjustment") -> bool:
+    """Whether others came before, without removals or with other weights."""
+    return bool(adjustment.removed or adjustment.eliminated or adjustment.sigma_factors)
 
 
 def evaluations(adjustment: "Adjustment") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -311,17 +325,36 @@ def image_precision(adjustment: "Adjustment") -> str:
     sigma, unit = image_sigmas(adjustment), adjustment.image_unit
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
-    # The smallest and the largest stand for all.
-    ends = sigma[[0, -1]]
-    parts = [f"{span(adjustment.sigma0 * ends)} {unit}"]
-    # Readers know the precision of a camera in µm and in pixels.
+    # The smallest and the largest stand for all; a few may be far from the others.
+    ends, median = sigma[[0, -1]], ""
+    if len(sigma) > 2:
+        weight = adjustment.problem.image_weights
+        middle = adjustment.sigma0 / np.median(weight[weight > 0])
+        median = f", median {significant(middle, 3)} {unit}"
+    a_priori = f"{KINDS[adjustment.sigma_origin]} {span(ends, 4)} {unit}"
+    return f"{_in_units(adjustment, adjustment.sigma0 * ends)}{median}  (σ0 × {a_priori})"
+
+
+def image_residuals_in_words(adjustment: "Adjustment") -> str:
+    """The RMS of the residuals of image coordinates."""
+    rms = adjustment.image_rms
+    if not np.isfinite(rms):
+        return "–"
+    return f"{_in_units(adjustment, np.array([rms]), 3)} of an image coordinate"
+
+
+def _in_units(adjustment: "Adjustment", lengths: Float[np.ndarray, " n"], digits: int = 5) -> str:
+    """Lengths in images, from the smallest to the largest, in their unit; readers know the
+    precision of a camera in µm and in pixels."""
+    unit = adjustment.image_unit
+    parts = [f"{span(lengths, digits)} {unit}"]
     if unit == "mm":
-        parts.insert(0, f"{span(1e3 * adjustment.sigma0 * ends)} µm")
+        parts.insert(0, f"{span(1e3 * lengths, digits)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
             size = abs(not_none(next(iter(pitch)))[0])
-            parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
-    return f"{' = '.join(parts)}  (σ0 × {KINDS[adjustment.sigma_origin]} {span(ends, 4)} {unit})"
+            parts.append(f"{span(lengths / size, 3)} px")
+    return " = ".join(parts)
 
 
 def unit_of_weight(adjustment: "Adjustment") -> str:
@@ -419,7 +452,8 @@ def failure_facts(adjustment: "Adjustment") -> list[tuple[str, str]]:
 def result_in_words(adjustment: "Adjustment") -> str:
     """Converged or not, in one line."""
     if adjustment.converged:
-        return f"converged after {count(adjustment.iterations, 'iteration')}"
+        several = ", the last of several adjustments" if is_last_of_several(adjustment) else ""
+        return f"converged after {count(adjustment.iterations, 'iteration')}{several}"
     return f"NOT converged: {adjustment.termination}"
 
 

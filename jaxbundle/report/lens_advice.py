@@ -35,8 +35,9 @@ FEWER_PARAMETERS = (
 ADVICE_ON_FIELD = {
     FEWER: "these photographs determine no further parameters of the camera, and the σ shown "
     "contain it",
-    RICHER: "a richer lens model may represent it (`calibrate --models` compares them; "
-    "`reconstruct` takes the camera by --camera); the σ shown contain it",
+    RICHER: "a richer lens model may represent it (free more coefficients of the camera in the "
+    "project, or choose another model there, and adjust it; of photographs of boards, `calibrate "
+    "--models` compares models); the σ shown contain it",
 }
 
 

@@ -12,6 +12,7 @@ from jaxbundle.report.head import (
     chi_squared,
     count_points,
     image_precision,
+    image_residuals_in_words,
     left_out_in_words,
     redundancy_in_words,
     result_in_words,
@@ -67,6 +68,7 @@ def summary(adjustment: "Adjustment") -> list[tuple[str, str]]:
         rows += [
             ("σ0", sigma0_in_words(adjustment)),
             ("Image precision", image_precision(adjustment)),
+            ("RMS residual", image_residuals_in_words(adjustment)),
             ("χ² test", chi_squared(adjustment)),
             *_cameras(adjustment),
             ("Points", _points(adjustment)),

@@ -155,7 +155,7 @@ def _correlated(adjustment: "Adjustment") -> list[Finding]:
         words = f"σ under correlated errors are {significant(ratio, 2)} times the classical ones"
         words += f"; {'; '.join(sentences[:2])}" if sentences else ""
         state = NOTED if has_shared_errors(adjustment) else GOOD
-        brief = f"σ {significant(ratio, 2)} times larger under correlated errors"
+        brief = f"σ {significant(ratio, 2)} times as large under correlated errors"
         all_findings.append(Finding("Correlated errors", state, words, brief))
     elif why := adjustment.why_no_error_model:
         brief = "no look at correlated errors"
@@ -365,8 +365,13 @@ def judge_blunders(
         return Finding("Blunders", DOUBTFUL, words, brief)
     # More than chance explains, but none that stands out: σ of some are too small.
     has_many = number_over > explained_by_chance(len(size))
-    brief = f"{count(number_over, 'large residual')} where chance gives {significant(expected, 2)}"
-    return Finding("Blunders", NOTED if has_many else GOOD, words, brief)
+    brief = []
+    if has_many:
+        excess = f"{count(number_over, 'large residual')}, {significant(expected, 2)} expected"
+        brief.append(f"{excess} by chance")
+    if number_removed:
+        brief.append(f"{count(number_removed, 'observation')} removed by data snooping")
+    return Finding("Blunders", NOTED if brief else GOOD, words, ", ".join(brief))
 
 
 def _compare_largest(largest: float, limit: float, number: int) -> str:

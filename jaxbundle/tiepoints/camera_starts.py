@@ -105,14 +105,14 @@ def start_cameras(
                 )
                 better = with_lens(better, cameras_of_lens, plain)
                 notes.append(
-                    f"camera {name}: {message}, but {stated_distance:.0f} px by the files: that of "
-                    "the files is used"
+                    f"camera {name!r}: {message}, but {stated_distance:.0f} px by the files: that "
+                    "of the files is used"
                 )
             else:
-                notes.append(f"camera {name}: {message}, k1 {p['k1']:.3f}")
+                notes.append(f"camera {name!r}: {message}, k1 {p['k1']:.3f}")
         elif not has_stated:
             notes.append(
-                f"camera {name}: the principal distance is a guess: no two of its "
+                f"camera {name!r}: the principal distance is a guess: no two of its "
                 "photographs agree on one"
             )
     return better, notes

@@ -191,7 +191,7 @@ def test_what_cannot_be_used_is_refused(tmp_path):
     found, _ = find_photographs([tmp_path])
     assert len(assign_cameras(found).cameras) == 2
     camera = jaxbundle.Camera("cam", "opencv", {"fx": 90.0, "fy": 90.0}, image_size=(100, 80))
-    with pytest.raises(InputError, match="two.png: 100 × 70 pixels, but camera cam has 100 × 80"):
+    with pytest.raises(InputError, match="two.png: 100 × 70 pixels, but camera 'cam' has 100 × 80"):
         assign_cameras(found, camera)
 
 
@@ -224,6 +224,6 @@ def test_bad_input_found_late_leaves_nothing(tmp_path, command, inner, left):
     )
     (tmp_path / "empty").mkdir()
     told = command("reconstruct", tmp_path / "photos", "--camera", camera, "--out", out)
-    assert told.status == 2 and "camera c has 9 × 6" in told.err
+    assert told.status == 2 and "camera 'c' has 9 × 6" in told.err
     assert out.exists() == left and not (tmp_path / "new").exists()
     assert not list((tmp_path / "empty").iterdir())

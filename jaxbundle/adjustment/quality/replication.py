@@ -147,12 +147,12 @@ class Replication(TableMethods):
     @property
     def sentence(self) -> str:
         """The factor in words; why there is none."""
-        subject = "jobs" if self.by == "jobs" else f"halves by {self.by}"
+        parts = "several jobs" if self.by == "jobs" else f"two halves of the {self.by}"
         if not self.splits:
-            return f"{subject} cannot be compared: {'; '.join(self.failed)}"
-        beginning = f"{subject} differ by {np.sqrt(self.ratio):.2f} times their classical σ"
+            return f"{parts} cannot be compared: {'; '.join(self.failed)}"
+        beginning = f"cameras from {parts} differ by {np.sqrt(self.ratio):.2f} classical σ"
         if self.model is not None:
-            beginning += f", {np.sqrt(self.ratio_correlated):.2f} times σ under correlated errors"
+            beginning += f", by {np.sqrt(self.ratio_correlated):.2f} σ under correlated errors"
         # As times of σ, the root of d²/n; the quantiles of a root are the roots of the quantiles.
         low, high = (1.0, 1.0) if self.band is None else np.sqrt(self.band)
         expected = f"{low:.2f} to {high:.2f}" if low < high else "1"

@@ -64,6 +64,7 @@ def result_dict(adjustment: "Adjustment", brief: bool = False) -> dict:
     if not adjustment.converged:
         return head | {"undetermined": list(adjustment.undetermined)}
     head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
+    head["image_rms"] = adjustment.image_rms
     head |= {"sigma_factors": adjustment.sigma_factors, "robust": adjustment.robust}
     head |= {"robust_scale": adjustment.robust_scale, "global_test": adjustment.global_test()}
     head |= {
