@@ -209,16 +209,18 @@ def _under_errors(
 ) -> Rows:
     """σ under errors that image points share; `common_sizes`: of the same size in all cameras."""
     status = np.where(batch.finite, rows["status"], NOT_FINITE)
-    forms, is_traced = solved_portions.forms(), solved_portions.traced(common_sizes)
-    forms.q[status != CONVERGED] = np.nan
+    is_sampled = solved_portions.sampled(common_sizes)
+    forms = solved_portions.forms(is_sampled)
     # Without residuals everything is zero, as it is classically.
     variance = rows["sigma0"] ** 2
+    forms.q[~is_sampled, 0] = (variance * rows["redundancy"])[~is_sampled]
+    forms.q[status != CONVERGED] = np.nan
     factor = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
     interior = factor[:, None, None] * rows["covariance"]
     sigma = np.concatenate([rows["sigma_position"], rows["sigma_angles"]], -1)
     pose = factor[:, None, None] * sigma**2
-    traces = solved_portions.traces(is_traced)
-    sums = BatchSums(forms, traces, is_traced, rows["redundancy"], interior, pose)
+    traces = solved_portions.traces(is_sampled)
+    sums = BatchSums(forms, traces, is_sampled, rows["redundancy"], interior, pose)
     views = rows["views"].sum(1)
     points = (rows["redundancy"] + len(batch.free) + POSE * views) // 2
     programs = BatchPrograms(solved_portions.scatter, solved_portions.parts)

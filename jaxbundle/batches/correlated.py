@@ -90,10 +90,19 @@ class ComponentParts(NamedTuple):
 
 @partial(compile_once, static=(0, 1))
 def forms_of_portion(
-    key: ProgramKey, settings: CorrelationSettings, sightings: Sightings, unknowns: CameraUnknowns
+    key: ProgramKey,
+    settings: CorrelationSettings,
+    sightings: Sightings,
+    unknowns: CameraUnknowns,
+    is_wanted: Bool[AnyArray, " cameras"],
 ) -> ComponentForms:
-    """The forms of every camera of a portion; `sightings`: with the weights of the adjustment."""
-    return key.for_every(lambda camera: _forms(key.model, settings, *camera))((sightings, unknowns))
+    """The forms of the cameras of a portion for which they are wanted; `sightings`: with the
+    weights of the adjustment."""
+    zero: list[Any] = [jnp.zeros(len(COMPONENTS)), jnp.zeros(())]
+    no_forms = lambda _: ComponentForms(*zero)
+    of_residuals = lambda camera: _forms(key.model, settings, *camera)
+    of_camera = lambda camera: jax.lax.cond(camera[2], of_residuals, no_forms, camera[:2])
+    return key.for_every(of_camera)((sightings, unknowns, is_wanted))
 
 
 @partial(compile_once, static=(0, 1))

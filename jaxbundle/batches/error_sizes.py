@@ -29,13 +29,14 @@ class BatchErrors(NamedTuple):
 
 
 class BatchSums(NamedTuple):
-    """What the errors of a batch are estimated from: `forms` of the residuals of all cameras, and
-    the `traces` of those that are `traced`; of the independent part of each camera the redundancy,
-    and the covariance of the interior orientation and the variances of the poses for σ0 = 1."""
+    """What the errors of a batch are estimated from: the `forms` of the residuals and the `traces`
+    of the cameras that are `sampled`, and vᵀv of the others; of the independent part of each camera
+    the redundancy, and the covariance of the interior orientation and the variances of the poses
+    for σ0 = 1."""
 
     forms: ComponentForms
     traces: ComponentTraces
-    traced: Bool[np.ndarray, " cameras"]
+    sampled: Bool[np.ndarray, " cameras"]
     redundancy: Float[np.ndarray, " cameras"]
     interior: Float[np.ndarray, "cameras n n"]
     pose: Float[np.ndarray, "cameras views 6"]
@@ -66,7 +67,7 @@ def batch_errors(
     """
     traces = sums.traces
     cubes = np.zeros_like(traces.cubes)
-    for n in np.flatnonzero(sums.traced).tolist():
+    for n in np.flatnonzero(sums.sampled).tolist():
         cubes[n] = with_traces(traces.cubes[n], traces.T[n])
     sums = sums._replace(traces=traces._replace(cubes=cubes))
     can_show = _can_show(sums, views, points, settings)
@@ -90,6 +91,7 @@ def _can_show(
     can_show[:, FIELD] &= points >= settings.min_points_of_field
     can_show[:, TRACKS] = views > 1
     can_show[:, GIVEN:] = (sums.forms.given >= settings.min_given_points)[:, None]
+    can_show[:, 1:] &= sums.sampled[:, None]
     sound = np.isfinite(sums.forms.q).all(1) & np.isfinite(sums.traces.T).all((1, 2))
     return can_show & np.asarray(sound)[:, None]
 
@@ -161,8 +163,8 @@ def _common_sizes(
     critical: float,
     programs: BatchPrograms,
 ) -> tuple[Float[np.ndarray, "cameras k"], SizedParts]:
-    """The same with one set of sizes, from the cameras that show most components, which others
-    take over; θ of the independent part is that of every camera."""
+    """The same with one set of sizes, from the sampled cameras that show most components, which
+    others take over; θ of the independent part is that of every camera."""
     (T, cubes), q = sums.traces, sums.forms.q
     theta = np.full(can_show.shape, np.nan)
     known_cameras = np.flatnonzero(can_show[:, 0])
@@ -170,18 +172,15 @@ def _common_sizes(
     white = lambda shared: np.clip(
         (q[known_cameras, 0] - shared) / sums.redundancy[known_cameras], 0, None
     )
-    if not (can_show[:, 0] & sums.traced).any():
-        # Without any traces independent errors alone.
+    if not (can_show[:, 0] & sums.sampled).any():
+        # Without any sample independent errors alone.
         theta[known_cameras, 0] = white(0.0)
         return theta, SizedParts.from_sums(sums, None)
-    components = np.flatnonzero(can_show[np.argmax(can_show.sum(1) * sums.traced)])
+    components = np.flatnonzero(can_show[np.argmax(can_show.sum(1) * sums.sampled)])
     block = np.ix_(components, components)
-    good = np.flatnonzero(can_show[:, components].all(1))
-    traced = good[sums.traced[good]]
-    # q is the sum of all cameras, T of those with traces: scaled to as many
-    times = len(good) / len(traced)
-    sum_of_traces = times * T[traced].sum(0)[block]
-    of_three = times * cubes[traced].sum(0)[np.ix_(components, components, components)]
+    good = np.flatnonzero(can_show[:, components].all(1) & sums.sampled)
+    sum_of_traces = T[good].sum(0)[block]
+    of_three = cubes[good].sum(0)[np.ix_(components, components, components)]
     common = SizeEquations(sum_of_traces, False, critical, of_three).solve(
         q[good].sum(0)[components]
     )[0]
@@ -196,12 +195,13 @@ def _common_sizes(
         parts_found.remaining[known_cameras][:, components[1:]] @ common[1:]
     )
     parts = SizedParts.from_sums(sums, parts_found)
-    if len(traced) >= 2 * SUMS.draws:
+    if len(good) >= 2 * SUMS.draws:
         # q of that many cameras are draws themselves, of errors as they are
-        deviation = q[traced][:, components] - T[traced][:, components][..., components] @ common
-        forms = times * deviation.T @ deviation
+        deviation = q[good][:, components] - T[good][:, components][..., components] @ common
+        forms = deviation.T @ deviation
     else:
-        forms = times * programs.scatter(np.nan_to_num(theta))[traced].sum(0)[block]
+        of_sampled = np.where(sums.sampled[:, None], np.nan_to_num(theta), 0.0)
+        forms = programs.scatter(of_sampled)[good].sum(0)[block]
     tables = parts.tables(known_cameras, components)
     parts.factor[np.ix_(known_cameras, components)] = widenings(
         theta[np.ix_(known_cameras, components)], sum_of_traces, forms, tables

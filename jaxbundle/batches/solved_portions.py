@@ -37,29 +37,31 @@ class SolvedPortions(NamedTuple):
     cameras: int
     views: int
 
-    def traced(self, common: bool) -> Bool[np.ndarray, " cameras"]:
-        """Whose traces are needed: of every solved camera, or for one set of sizes of some of them,
-        as far as there are with views enough for components by view."""
+    def sampled(self, common: bool) -> Bool[np.ndarray, " cameras"]:
+        """Cameras from which sizes are estimated: every solved one, or for one set of sizes some of
+        them, as far as there are with views enough for components by view."""
         solved, views = np.zeros((2, self.cameras), int)
         for portion, rows in zip(self.portions, self.rows):
             number = len(portion.cameras)
             solved[portion.cameras] = rows["status"][:number] == CONVERGED
             views[portion.cameras] = rows["views"][:number].sum(1)
-        is_traced = solved > 0
+        is_sampled = solved > 0
         if common:
-            has_many_views = is_traced & (views >= DEFAULTS.min_images)
-            candidates = np.flatnonzero(has_many_views if has_many_views.any() else is_traced)
-            step = max(len(candidates) / SUMS.traced, 1)
-            is_traced = np.zeros(self.cameras, bool)
-            is_traced[candidates[np.arange(0, len(candidates), step).astype(int)]] = True
-        return is_traced
+            has_many_views = is_sampled & (views >= DEFAULTS.min_images)
+            candidates = np.flatnonzero(has_many_views if has_many_views.any() else is_sampled)
+            step = max(len(candidates) / SUMS.cameras, 1)
+            is_sampled = np.zeros(self.cameras, bool)
+            is_sampled[candidates[np.arange(0, len(candidates), step).astype(int)]] = True
+        return is_sampled
 
-    def forms(self) -> ComponentForms:
-        """Those of all cameras."""
+    def forms(self, is_wanted: Bool[np.ndarray, " cameras"]) -> ComponentForms:
+        """Those of some cameras."""
         number = len(COMPONENTS)
         q, number_given = np.zeros((self.cameras, number)), np.zeros(self.cameras)
-        for portion, rows in zip(self.portions, self.rows):
-            forms_found = forms_of_portion(self.key, DEFAULTS, *_adjusted(portion, rows))
+        for portion, rows, wanted_of_portion in self._wanted_portions(is_wanted):
+            forms_found = forms_of_portion(
+                self.key, DEFAULTS, *_adjusted(portion, rows), wanted_of_portion
+            )
             q[portion.cameras], number_given[portion.cameras] = _without_padding(
                 portion, forms_found
             )
