@@ -64,6 +64,7 @@ def write_ply(
     head = [
         "ply",
         "format binary_little_endian 1.0",
+        f"comment {point_count} points, then pyramids of {len(corners)} images (error NaN)",
         f"comment error: mean reprojection error in {unit}",
         f"element vertex {len(vertices)}",
         *(f"property double {axis}" for axis in "xyz"),
