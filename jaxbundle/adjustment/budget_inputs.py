@@ -177,7 +177,8 @@ def groups_of(
                 continue
             conversion, unit = part.units[k]
             inverse = part.inverse_sigma[rows]
-            u = (scale or 1.0) / inverse
+            # A size of zero is an estimate, too: all errors are in the shared components.
+            u = (1.0 if scale is None else scale) / inverse
             # Effects are of one σ a priori: c = effect/σ.
             c = effect[rows] * inverse[:, None]
             degrees = redundancy if scale is not None else estimated.get(part.kind, math.inf)

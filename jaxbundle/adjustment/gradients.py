@@ -15,6 +15,7 @@ from jaxbundle.adjustment.solve import solve
 from jaxbundle.arguments import integer, positive, show
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.indexing.rows import Data
 from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.system.programs import compile_once, quick_jit
@@ -75,6 +76,7 @@ def check_gradients(
         raise InputError(
             f"function must be a function, a CameraModel or a Problem, but is {show(function)}"
         )
+    require_x64()
     directions = integer("directions", directions)
     step, tolerance = positive("step", step), positive("tolerance", tolerance)
     f, x, sizes = _flatten(*_as_function(function, arguments, options))

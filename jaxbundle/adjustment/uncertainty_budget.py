@@ -202,7 +202,8 @@ class UncertaintyBudget(TableMethods):
             self.measurands, self.combined, self.degrees, self.k, self.expanded
         ):
             value, value_text = estimate(measurand.value, float(U), 2)
-            degrees_text = "∞" if nu > MANY_DEGREES else f"{nu:.0f}"
+            # With a decimal where it decides k: it is not truncated (GUM G.6.4).
+            degrees_text = "∞" if nu > MANY_DEGREES else f"{nu:.1f}" if nu < 100 else f"{nu:.0f}"
             # u in the form of U: both with an exponent, or none
             combined = f"{u:.2e}" if "e" in value_text else significant(float(u))
             rows.append(

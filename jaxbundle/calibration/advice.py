@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from jaxbundle.calibration.quality import Coverage, CrossValidation
 from jaxbundle.cameras import CameraModel
 from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
+from jaxbundle.network.columns import list_some
 from jaxbundle.report.lens_advice import RICHER
 
 
@@ -34,6 +35,8 @@ class AdviceSettings:
       sets of photographs in the examples.
     - `min_removed`: photographs in which snooping has removed the same point of the board: gross
       errors of detection strike a point twice by chance.
+    - `max_view_ratio`: RMS of a photograph over the median of all. Four times the variance: of 12
+      residuals chance gives it once in 10⁵, and boards have more.
     - `min_reach`, `min_part`: of the half diagonal to the farthest point; of the cells of the image
       with points. Beyond the farthest point the distortion is extrapolated by its highest power.
     - `max_rms`: a larger RMS, in pixels, is not caused by corner detection, which has a tenth.
@@ -50,6 +53,7 @@ class AdviceSettings:
     min_move: float = 0.02
     max_alike: float = 0.2
     min_removed: int = 4
+    max_view_ratio: float = 2.0
     min_reach: float = 0.85
     min_part: float = 0.6
     max_rms: float = 1.0
@@ -126,6 +130,22 @@ def often_removed(
         f"point {name} of the board was removed in {n} of {views} photographs: it is not where it "
         "is given; look at the print there, or estimate the points of the board (--board-free)"
         for n, name in sorted(often, reverse=True)
+    ]
+
+
+def misfitting_views(
+    names: Sequence[str], rms: Float[np.ndarray, " views"], settings: AdviceSettings = ADVICE
+) -> list[str]:
+    """Photographs whose residuals are much larger than those of the others, in words."""
+    ratio = rms / np.nanmedian(rms) if np.nanmedian(rms) > 0 else np.zeros(len(rms))
+    places = np.flatnonzero(ratio > settings.max_view_ratio)
+    if not len(places):
+        return []
+    places = places[np.argsort(-ratio[places])]
+    listed = list_some([names[k] for k in places], 5)
+    return [
+        f"{listed}: residuals up to {ratio[places[0]]:.1f} times as large as in most photographs; "
+        "another camera, another zoom or focus, or a movement? Leave out what is not of this camera"
     ]
 
 

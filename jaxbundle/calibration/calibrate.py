@@ -2,8 +2,9 @@
 
 1. The board is detected in every photograph (`measure`), or its image points are given.
 2. Start values of camera and poses; impossible views are excluded (`start`).
-3. Adjustment as a network with residuals in the measured image, with data snooping or robust. The
-   board is
+3. Adjustment as a network with residuals in the measured image, with data snooping or robust. A
+   view that loses more than a third of its points by data snooping is excluded, and the others are
+   adjusted again. The board is
 
        known      its points are fixed: exact coordinates of a drawing
        weighted   its points are control points with a σ: a print is not exact and not flat
@@ -14,7 +15,7 @@
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.adjustment.adjust import adjust, check_options
 from jaxbundle.adjustment.result import Adjustment
@@ -105,45 +106,72 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
     views = views_of(photographs, board, progress)
-    start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
     # Held parameters need no prior.
     prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
     start_camera = Camera(
         camera,
         model,
-        start.parameters,
+        {},
         free,
         prior,
         image_size=(int(columns), int(rows)),
         pixel_size=pixel_size,
     )
-    network = board_network(
-        start,
-        start_camera,
-        sigma_image,
+    network_of = partial(
+        board_network,
+        sigma_image=sigma_image,
         board_sigma=board_sigma,
         board_free=board_free,
         object_unit=object_unit,
     )
-    result = adjust(network, **options)
-    if views.board.diameters.any() and result.converged:
-        # Twice: the shifts depend on the poses, and these change by the shifts, by a small part.
-        for _ in range(2):
-            centred = _without_eccentricity(start, result, start_camera)
-            network = board_network(
-                dataclasses.replace(start, views=centred),
-                start_camera,
-                sigma_image,
-                board_sigma=board_sigma,
-                board_free=board_free,
-                object_unit=object_unit,
-            )
-            result = adjust(network, **options)
-        start = dataclasses.replace(start, views=centred)
+    while True:
+        start = start_values(views, camera_model, free, pixel_size, given)
+        start_camera = dataclasses.replace(start_camera, parameters=start.parameters)
+        views, result = _adjust_views(start, start_camera, network_of, options)
+        is_misfitting = _misfitting_views(views, result)
+        # Fewer than two would be left: nothing says which are right.
+        if not is_misfitting.any() or is_misfitting.sum() > len(views) - 2:
+            break
+        views = views.take(~is_misfitting, MISFITTING)
     if truth("correlated", correlated):
         result = result.with_correlated_errors("views")
-    return Calibration(start.views, result, cross_validation)
+    return Calibration(views, result, cross_validation)
+
+
+MISFITTING = (
+    "more than a third of its points do not fit the other photographs: another camera, another "
+    "zoom or focus, or it was shaken"
+)
+
+
+def _adjust_views(
+    start: CalibrationStart,
+    camera: Camera,
+    network_of: Callable[[CalibrationStart, Camera], Network],
+    options: Mapping[str, Any],
+) -> tuple[BoardViews, Adjustment]:
+    """The adjustment of all views, and these without the eccentricity of circles."""
+    result = adjust(network_of(start, camera), **options)
+    if start.views.board.diameters.any() and result.converged:
+        # Twice: the shifts depend on the poses, and these change by the shifts, by a small part.
+        for _ in range(2):
+            centred = _without_eccentricity(start, result, camera)
+            network = network_of(dataclasses.replace(start, views=centred), camera)
+            result = adjust(network, **options)
+        return centred, result
+    return start.views, result
+
+
+def _misfitting_views(views: BoardViews, result: Adjustment) -> Bool[np.ndarray, " views"]:
+    """Views of which data snooping has removed more than a third of the points."""
+    row_of = {name: row for row, name in enumerate(views.names)}
+    names = result.problem.network.images.id
+    removed = np.zeros(len(views), int)
+    for item in result.removed:
+        for ray in item.rows if item.kind == "image" else ():
+            removed[row_of[names[result.problem.image[ray]]]] += 1
+    return removed > views.visible.sum(1) / 3
 
 
 def views_of(

@@ -226,8 +226,9 @@ def fill_calibrations(
     write_text(folder / PAGE, compose_calibrations(calibrations, origin))
     write_text(folder / RESULT, json_text(calibrations_dict(calibrations)))
     if calibrations.rig is not None:
-        for name in calibrations.rig.names:
-            text = camera_text(calibrations.rig.camera(name), calibrations.rig.sigma[name])
+        rig = calibrations.rig
+        for name in rig.names:
+            text = camera_text(rig.camera(name), rig.stated_sigma[name])
             write_text(folder / f"rig_{file_name(name)}.toml", text)
         fill_rig(calibrations.rig.network(), folder / RIG)
         views = network_of_views(calibrations.rig)

@@ -12,7 +12,13 @@ from jaxtyping import Array, Float
 from jaxbundle import plotting
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.calibration import quality
-from jaxbundle.calibration.advice import ADVICE, advice, often_removed, suggest
+from jaxbundle.calibration.advice import (
+    ADVICE,
+    advice,
+    misfitting_views,
+    often_removed,
+    suggest,
+)
 from jaxbundle.calibration.affinity import MissingAffinity, find_missing_affinity
 from jaxbundle.calibration.bias import CalibrationBias, find_bias
 from jaxbundle.calibration.mapping_error import MappingError, mapping_error
@@ -204,6 +210,8 @@ class Calibration(TableMethods):
             # Only if it was made: four more adjustments are not made for an advice.
             self.__dict__.get("cross_validation"),
         )
+        images = self.adjustment.images
+        warnings = [*misfitting_views(images["id"].tolist(), images["rms"]), *warnings]
         missed = self._missing_affinity
         if missed is not None and missed.missed:
             warnings = [*warnings, str(missed)]

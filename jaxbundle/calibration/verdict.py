@@ -1,5 +1,6 @@
 """The verdict on a calibration: that of its adjustment, with coverage and cross-validation."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from jaxbundle.calibration.advice import ADVICE
@@ -34,12 +35,16 @@ def conclude_calibration(calibration: "Calibration") -> Verdict:
 
 def conclude_calibrations(calibrations: "Calibrations") -> Verdict:
     """The verdict on several cameras (`Calibrations`): a finding for each, and for their rig."""
-    findings = [
-        _judge_camera(name, calibration) for name, calibration in calibrations.cameras.items()
-    ]
-    if calibrations.rig is not None:
-        findings.append(_judge_rig(calibrations.rig))
+    findings = judge_cameras_and_rig(calibrations.cameras, calibrations.rig)
     return Verdict(*in_words(findings, 0), tuple(findings))
+
+
+def judge_cameras_and_rig(
+    cameras: Mapping[str, "Calibration"], rig: "RigCalibration | None"
+) -> list[Finding]:
+    """A finding for each of several cameras, and one for their rig."""
+    findings = [_judge_camera(name, calibration) for name, calibration in cameras.items()]
+    return findings if rig is None else [*findings, _judge_rig(rig)]
 
 
 def _judge_camera(name: str, calibration: "Calibration") -> Finding:

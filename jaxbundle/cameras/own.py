@@ -30,7 +30,7 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
     with local_x64():
         p = np.array([values[name] for name in model.parameters], float)
         numbers = [np.asarray(x) for x in _near_the_axis(model, p)]
-    image, (a, b, c, d), misclosure = numbers
+    image, (a, b, c, d), misclosure, misclosure_of_changed = numbers
     if not (np.isfinite(image).all() and np.isfinite([a, b, c, d]).all()):
         raise ValueError(
             f"{where}its formula has no finite value and derivatives on the optical axis, with the "
@@ -45,10 +45,13 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
     size = max(abs(values[name]) for name in model.principal_distance)
     # 1e-9 of the principal distance: 1e-5 pixels. An inverse that ends its iterations early, as
     # OpenCV's, is refused, since the two domains of a residual would differ.
-    if model.inverse is not None and not misclosure <= 1e-9 * size:
+    largest = 1e-9 * size
+    if model.inverse is not None and (not misclosure <= largest or misclosure_of_changed > largest):
+        worst = float(np.fmax(misclosure, misclosure_of_changed))
         raise ValueError(
             f"{where}inverse is not the inverse of its formula: a point comes back "
-            f"{misclosure:.3g} {model.unit} beside itself; omit inverse, and it is computed"
+            f"{worst:.3g} {model.unit} beside itself, at the start values or with parameters near "
+            "them; omit inverse, and it is computed"
         )
 
 
@@ -81,9 +84,9 @@ def _check_form(model: CameraModel) -> None:
 
 
 @partial(compile_once, static=0)
-def _near_the_axis(model: CameraModel, p: Any) -> tuple[Array, tuple[Scalar, ...], Array]:
+def _near_the_axis(model: CameraModel, p: Any) -> tuple[Array, tuple[Scalar, ...], Array, Array]:
     """Image of the axis, derivative of the formula there, and the error of a point near it after
-    formula and inverse."""
+    formula and inverse, with the parameters and with others near them."""
     p = tuple(p)
     zero, formula = jnp.zeros(()), getattr(model, model.own_formula)
     size = p[model.parameters.index(model.principal_distance[0])]
@@ -102,6 +105,14 @@ def _near_the_axis(model: CameraModel, p: Any) -> tuple[Array, tuple[Scalar, ...
     slant = 0.05
     nearby = axis_point[0] + slant * size, axis_point[1] - 0.6 * slant * size
     inverse = model.to_ideal if model.own_formula == "from_ideal" else model.from_ideal
-    there_and_back = inverse(p, *formula(p, *nearby))
-    misclosure = jnp.abs(there_and_back[0] - nearby[0]) + jnp.abs(there_and_back[1] - nearby[1])
-    return jnp.stack(value), derivative, misclosure
+
+    def misclosure(p: tuple[Scalar, ...]) -> Array:
+        there_and_back = inverse(p, *formula(p, *nearby))
+        return jnp.abs(there_and_back[0] - nearby[0]) + jnp.abs(there_and_back[1] - nearby[1])
+
+    # Coefficients are mostly zero at the start, where a wrong inverse inverts: each is changed so
+    # that it moves the point by 1e-4 of the principal distance.
+    by_parameter = jax.jacfwd(lambda p: jnp.stack(formula(p, *nearby)))(p)
+    reach = [jnp.linalg.norm(column) for column in by_parameter]
+    changed = tuple(x + 1e-4 * size / jnp.where(r > 0, r, jnp.inf) for x, r in zip(p, reach))
+    return jnp.stack(value), derivative, misclosure(p), misclosure(changed)

@@ -215,19 +215,21 @@ def _accept(
 
 
 def length_test_of(result: Any, lengths: Any, **options: Any) -> LengthTest:
-    """The test of calibrated lengths of a result, of the first of its parts that has them.
+    """The test of calibrated lengths of a result, of the first of its parts, or cameras, that has
+    them.
 
     **Raises:** `InputError` as `length_errors`."""
-    parts = getattr(result, "parts", None)
-    if not parts:
+    several = getattr(result, "parts", None) or tuple(getattr(result, "cameras", {}).values())
+    adjustments = [part.adjustment for part in several if hasattr(part, "adjustment")]
+    if not adjustments:
         return length_errors(result, lengths, **options)
     calibrated = read_lengths(lengths)
-    for part in parts[:-1]:
+    for adjustment in adjustments[:-1]:
         try:
-            return length_errors(part.adjustment, calibrated, **options)
+            return length_errors(adjustment, calibrated, **options)
         except InputError:
             continue
-    return length_errors(parts[-1].adjustment, calibrated, **options)
+    return length_errors(adjustments[-1], calibrated, **options)
 
 
 def _judge(result: Any, test: LengthTest | None, criterion: Criterion) -> AcceptanceRow:

@@ -1,6 +1,8 @@
 """Length measurement errors: VDI/VDE 2634 Part 1, with a verdict after ISO 14253-1.
 
-Calibrated lengths that have no part in the adjustment are compared with those of its points:
+Calibrated lengths that have no part in the adjustment are compared with those of its points, check
+points among them. Those between two control points have: coordinates that are given measure
+nothing.
 
     E = L_measured − L_calibrated                         VDI/VDE 2634-1 (2002): Δl = l_m − l_k
     MPE = min(A + L/K, B)                                 ISO 10360-2 (2009), forms of an MPE
@@ -43,6 +45,7 @@ from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.network.columns import as_columns, count, did_you_mean, list_some
 from jaxbundle.report.layout import fixed, significant, table
 from jaxbundle.results import TableMethods
+from jaxbundle.types import not_none
 
 CONFORMS, FAILS, OPEN = "conformity proven", "nonconformity proven", "neither proven"
 RULES = ("guard band", "simple acceptance")
@@ -164,8 +167,8 @@ class LengthTest(TableMethods):
 
     **Fields:** `lengths`, the calibrated ones that could be compared; `measured`, and `sigma` of
     it by the adjustment; `mpe`, None without; `rule`: "guard band" (ISO 14253-1) or "simple
-    acceptance"; `missing`: lengths whose points were not measured; `diagonal` of the measuring
-    volume; `unit`.
+    acceptance"; `missing`: lengths whose points were not measured; `given`: those between control
+    points, which are not tested; `diagonal` of the measuring volume; `unit`.
     """
 
     lengths: CalibratedLengths
@@ -176,6 +179,7 @@ class LengthTest(TableMethods):
     mpe: PermissibleError | None = None
     rule: str = RULES[0]
     missing: tuple[tuple[str, str], ...] = ()
+    given: tuple[tuple[str, str], ...] = ()
 
     @property
     def error(self) -> Float[np.ndarray, " n"]:
@@ -215,11 +219,12 @@ class LengthTest(TableMethods):
 
     @property
     def verdict(self) -> str:
-        """The verdict on the test: nonconformity if one length proves it, conformity if all do;
-        empty without an MPE."""
+        """The verdict on the test: nonconformity if one length proves it, conformity if all do,
+        and none is missing; empty without an MPE."""
         verdicts = self.verdicts
         if not verdicts:
             return ""
+        verdicts += (OPEN,) * len(self.missing)
         return FAILS if FAILS in verdicts else OPEN if OPEN in verdicts else CONFORMS
 
     @property
@@ -308,6 +313,7 @@ class LengthTest(TableMethods):
             "rule": self.rule,
             "verdict": self.verdict or None,
             "missing": [list(ends) for ends in self.missing],
+            "given": [list(ends) for ends in self.given],
             "lengths": [dict(zip(columns, row)) for row in zip(*columns.values())],
         }
 
@@ -320,6 +326,9 @@ class LengthTest(TableMethods):
         ]
         if self.missing:
             lines.append(f"not measured: {list_some(self.missing, 5, ' – '.join)}")
+        if self.given:
+            names = list_some(self.given, 5, " – ".join)
+            lines.append(f"not tested, both ends are control points: {names}")
         return "\n".join(lines)
 
 
@@ -347,7 +356,8 @@ def length_errors(
 
     - `given`: an `Adjustment`, or a result that has one as `adjustment`.
     - `lengths`: calibrated lengths that the adjustment does not have: the path of a table with the
-      columns from, to, value, sigma and, if wanted, line; or its columns.
+      columns from, to, value, sigma and, if wanted, line; or its columns. Ends are points of the
+      adjustment, or its check points as intersected.
     - `mpe`: maximum permissible error, a text such as "20 um + L/50000".
     - `rule`: "guard band" (ISO 14253-1) or "simple acceptance".
     - `volume`: the sides of the measuring volume, object unit; by default those of the box about
@@ -355,9 +365,9 @@ def length_errors(
 
     **Returns:** a `LengthTest`.
 
-    **Raises:** `InputError` if no length has both of its points, if the scale of the network is
-    open, or for lengths that are observations of the adjustment; `NotSolvedError` without a
-    solution.
+    **Raises:** `InputError` if no length has both of its points, if all are between control points,
+    if the scale of the network is open, or for lengths that are observations of the adjustment;
+    `NotSolvedError` without a solution.
     """
     adjustment = getattr(given, "adjustment", given)
     if not isinstance(adjustment, Adjustment):
@@ -370,20 +380,27 @@ def length_errors(
         )
     unit = adjustment.network.object_unit
     limit = read_mpe(mpe, unit) if isinstance(mpe, str) else mpe
-    rows_of = {
-        id: row
-        for row, (id, has_result) in enumerate(
-            zip(adjustment.problem.network.points.id, adjustment.located)
-        )
-        if has_result
-    }
+    known_points = _positions(adjustment)
     _refuse_observed(adjustment, calibrated)
-    testable = [i for i, ends in enumerate(calibrated.ends) if all(end in rows_of for end in ends)]
-    missing = tuple(ends for i, ends in enumerate(calibrated.ends) if i not in set(testable))
-    if not testable:
+    points = adjustment.problem.network.points
+    is_control = points.has_role("control", "fixed")
+    control = {id for id, is_given in zip(points.id, is_control) if is_given}
+    given_lengths = tuple(ends for ends in calibrated.ends if control.issuperset(ends))
+    rows_measured = [
+        i for i, ends in enumerate(calibrated.ends) if all(end in known_points for end in ends)
+    ]
+    missing = tuple(ends for i, ends in enumerate(calibrated.ends) if i not in set(rows_measured))
+    if not rows_measured:
+        names = sorted({e for ends in missing for e in ends if e not in known_points})
         raise InputError(
             f"{calibrated.source}: no length has both points in the result; missing are "
-            f"{list_some(sorted({e for ends in missing for e in ends if e not in rows_of}))}"
+            f"{list_some(names)}"
+        )
+    testable = [i for i in rows_measured if calibrated.ends[i] not in given_lengths]
+    if not testable:
+        raise InputError(
+            f"{calibrated.source}: every length is between control points, whose coordinates are "
+            "given: they test nothing; make them check points (--check), or use other lengths"
         )
     tested = CalibratedLengths(
         tuple(calibrated.ends[i] for i in testable),
@@ -392,23 +409,60 @@ def length_errors(
         tuple((calibrated.line or ("",) * len(calibrated))[i] for i in testable),
         calibrated.source,
     )
-    rows = np.array([[rows_of[end] for end in ends] for ends in tested.ends])
-    lengths_between = lambda values: _distances(values, rows)
-    variance = np.diagonal(adjustment.covariance_of(lengths_between, classical=True))
-    if adjustment.error_model is not None:
-        variance = np.fmax(variance, np.diagonal(adjustment.covariance_of(lengths_between)))
-    ends = adjustment.point_values[rows].reshape(-1, 3)
-    sides = np.ptp(ends, axis=0) if volume is None else np.asarray(volume, float)
+    ends = np.array([[known_points[end] for end in ends] for ends in tested.ends])
+    measured = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    sides = np.ptp(ends.reshape(-1, 3), axis=0) if volume is None else np.asarray(volume, float)
     return LengthTest(
         tested,
-        np.asarray(lengths_between(adjustment.values)),
-        np.sqrt(np.clip(variance, 0, None)),
+        measured,
+        _sigma_of_lengths(adjustment, tested, ends),
         unit,
         float(np.linalg.norm(sides)),
         limit,
         rule,
         missing,
+        given_lengths,
     )
+
+
+def _positions(adjustment: Adjustment) -> dict[str, Float[np.ndarray, "3"]]:
+    """The adjusted points with coordinates, and the intersected check points, by id."""
+    rows = zip(adjustment.problem.network.points.id, adjustment.point_values, adjustment.located)
+    positions = {id: position for id, position, has_result in rows if has_result}
+    checks = adjustment.check_points
+    if checks is not None:
+        intersected = zip(checks.id, checks.position)
+        positions |= {id: X for id, X in intersected if np.isfinite(X).all()}
+    return positions
+
+
+def _sigma_of_lengths(
+    adjustment: Adjustment, lengths: CalibratedLengths, ends: Float[np.ndarray, "n 2 3"]
+) -> Float[np.ndarray, " n"]:
+    """σ of measured lengths: between adjusted points from their joint covariance; with a check
+    point from those of both ends, taken as independent, which errors of the orientations that they
+    have in common make too large rather than too small."""
+    row_of = {id: row for row, id in enumerate(adjustment.problem.network.points.id)}
+    is_adjusted = np.array([all(end in row_of for end in pair) for pair in lengths.ends])
+    variance = np.zeros(len(lengths))
+    if is_adjusted.any():
+        pairs = [lengths.ends[i] for i in np.flatnonzero(is_adjusted)]
+        rows = np.array([[row_of[end] for end in pair] for pair in pairs])
+        lengths_between = lambda values: _distances(values, rows)
+        variances = np.diagonal(adjustment.covariance_of(lengths_between, classical=True))
+        if adjustment.error_model is not None:
+            variances = np.fmax(variances, np.diagonal(adjustment.covariance_of(lengths_between)))
+        variance[is_adjusted] = variances
+    if not is_adjusted.all():
+        checks = not_none(adjustment.check_points)
+        blocks = dict(zip(row_of, adjustment.point_covariance)) | dict(
+            zip(checks.id, checks.covariance)
+        )
+        for i in np.flatnonzero(~is_adjusted):
+            difference = ends[i, 1] - ends[i, 0]
+            along = difference / np.linalg.norm(difference)
+            variance[i] = along @ sum(blocks[end] for end in lengths.ends[i]) @ along
+    return np.sqrt(np.clip(variance, 0, None))
 
 
 def _distances(values: Values, rows: np.ndarray) -> Float[Array, " n"]:
@@ -456,4 +510,5 @@ def join_length_tests(tests: Sequence[LengthTest] | Mapping[str, LengthTest]) ->
         sigma=np.concatenate([t.sigma for t in repetitions]),
         diagonal=max(t.diagonal for t in repetitions),
         missing=tuple(dict.fromkeys(ends for t in repetitions for ends in t.missing)),
+        given=tuple(dict.fromkeys(ends for t in repetitions for ends in t.given)),
     )

@@ -110,10 +110,10 @@ def find_cards(certificate: "Certificate") -> list[Card]:
         }[test.verdict]
         note = f"MPE {test.mpe.text or significant(test.mpe.constant)}" if test.mpe else ""
         cards.append(Card("Length measurement", verdict_words[0], note, verdict_words[1]))
-    for part in certificate.parts[:1]:
-        adjustment_verdict = part.adjustment.verdict
-        state = STATES.get(adjustment_verdict.state, "")
-        cards.append(Card("Tests of the adjustment", adjustment_verdict.state, "see report", state))
+    from jaxbundle.certificates.document import verdict_of
+
+    verdict = verdict_of(certificate.result)
+    cards.append(Card("Tests", verdict.state, verdict.words, STATES.get(verdict.state, "")))
     if test is not None:
         rms = readable_length(test.rms, test.unit)
         note = f"largest of {count(len(test.lengths), 'length')}, RMS {rms}"
@@ -364,6 +364,9 @@ def lengths_section(test: "LengthTest") -> Section:
     if test.missing:
         ends = [" – ".join(ends_of_length) for ends_of_length in test.missing]
         parts += ["<h3>Not measured</h3>\n", items(ends)]
+    if test.given:
+        ends = [" – ".join(ends_of_length) for ends_of_length in test.given]
+        parts += ["<h3>Not tested: both ends are control points</h3>\n", items(ends)]
     title = "Length measurement errors (VDI/VDE 2634-1)"
     return Section("lengths", title, "".join(parts), "Length errors")
 

@@ -297,8 +297,10 @@ def _lengths(subject: Subject) -> LengthTest:
 
 def _lme(subject: Subject, _: str) -> QuantityValues:
     test = _lengths(subject)
-    errors = zip(test.lengths.ends, np.abs(test.error).tolist())
-    return QuantityValues({f"length {a} – {b}": error for (a, b), error in errors}, test.unit)
+    errors = dict(zip(test.lengths.ends, np.abs(test.error).tolist()))
+    # A length that was not measured is not accepted.
+    errors |= dict.fromkeys(test.missing, math.nan)
+    return QuantityValues({f"length {a} – {b}": e for (a, b), e in errors.items()}, test.unit)
 
 
 def _lme_rms(subject: Subject, _: str) -> QuantityValues:

@@ -41,7 +41,7 @@ def test_the_page_has_every_part_once_and_nothing_of_others_unescaped(document):
         assert id in ids
     assert "A &lt;b&gt;lab&lt;/b&gt; &amp; sons" in html
     assert "2026-014" in html and "K2 not modelled" in html
-    for words in ("Expanded uncertainty".lower(), "conformity proven", "RMSE_3D", "not accepted"):
+    for words in ("Expanded uncertainty".lower(), "neither proven", "RMSE_3D", "not accepted"):
         assert words in html
     assert html.count('class="blank"') == 8  # wanted fields that are not given
 
@@ -54,7 +54,9 @@ def test_the_numbers_are_those_of_its_parts(document, tmp_path):
     )
     assert found["acceptance"]["met"] is False
     assert found["length_errors"]["missing"] == [["no", "14"]]
-    assert found["length_errors"]["verdict"] == "conformity proven"
+    # One conforms, the other is missing: all of them must.
+    assert found["length_errors"]["verdict"] == "neither proven"
+    assert found["acceptance"]["criteria"][0]["met"] is False
     assert found["parts"][0]["positional_accuracy"]["horizontal_class"] == 0.05
     held = part.budget.lines[-1]
     assert held.words == "K2 not modelled" and held.uncertainty == pytest.approx(1e-8 / 3**0.5)

@@ -32,6 +32,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
 from jaxbundle.arguments import without_masks
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
 from jaxbundle.geometry.vectors import Triple, Vector, difference, point_on_ray, unit, unpack
 from jaxbundle.implicit import implicit_root
@@ -288,6 +289,7 @@ def project_points(
     height: Float[AnyArray, " n"],
 ) -> tuple[Scalar, Scalar, Array]:
     """Lines, samples and statuses of many points, radians and metres."""
+    require_x64()
     place = lambda *point: (*project(rpc, *point), domain(rpc, *point))
     return jax.vmap(place)(longitude, latitude, height)
 
@@ -301,6 +303,7 @@ def locate_points(
     height: Float[AnyArray, " n"],
 ) -> tuple[Array, Array, Array]:
     """Longitudes, latitudes (radians) and statuses of many positions at given heights."""
+    require_x64()
     inverse = fit_inverse(rpc)
 
     def locate_all(max_steps: int) -> tuple[Array, Array, Array]:
@@ -320,6 +323,7 @@ def locate_points_on(
     rpc: Rpc, surface: GroundSurface, line: Float[AnyArray, " n"], sample: Float[AnyArray, " n"]
 ) -> tuple[Array, Array, Scalar, Array]:
     """Longitudes, latitudes, heights and statuses of many positions on a surface."""
+    require_x64()
     inverse = fit_inverse(rpc)
     return jax.vmap(lambda l, s: locate_on(rpc, surface, l, s, inverse))(line, sample)
 
