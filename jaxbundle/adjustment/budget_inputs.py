@@ -243,7 +243,7 @@ def shared_errors(
         size = np.sqrt((component.products(D.T) ** 2).sum(0)) * factor
         # A size that is hardly determined: no estimate has less than one degree of freedom.
         degrees = max(2 * (theta / sigma_theta) ** 2, 1.0) if sigma_theta > 0 else math.inf
-        unit = adjustment.image_unit if component.unit == "image" else ""
+        unit = adjustment.image_unit if component.unit == "image" else "σ a priori"
         lines.append(
             BudgetLine(
                 f"shared error: {component.name}",

@@ -60,7 +60,8 @@ def load_adjustment(
     if not math.isclose(sigma0, stored.sigma0, rel_tol=1e-6) and not math.isnan(stored.sigma0):
         raise InputError(
             f"{path}: its σ0 is {stored.sigma0:.6g}, but its measurements and values give "
-            f"{sigma0:.6g}: it is damaged, or was saved by another version ({stored.version})"
+            f"{sigma0:.6g}: it is damaged, was saved by another version ({stored.version}), or a "
+            "model or kind of your own is not the one that it was saved with"
         )
     return result
 

@@ -52,6 +52,8 @@ from jaxbundle.adjustment.quality.requested_results import (
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.result_tables import observations
 from jaxbundle.arguments import number, show
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.coefficient_units import coefficient_unit
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.quality.distributions import normal_quantile, t_quantile
@@ -395,7 +397,8 @@ def _value_of_name(
     kind, id, parameter = split_name(request.name)
     if kind == "camera":
         camera = next(c for c in adjustment.problem.network.cameras if c.id == id)
-        return value, unit_of_parameter(camera.model, parameter)
+        unit = unit_of_parameter(camera.model, parameter)
+        return value, unit or coefficient_unit(get_model(camera.model), parameter)
     axes = EXTERIOR[:3] if kind == "image" else ("X", "Y", "Z")
     return value + float(adjustment.problem.origin[axes.index(parameter)]), (
         adjustment.network.object_unit

@@ -81,7 +81,7 @@ def find(calibration: "Calibration") -> list[Finding]:
     if (bias := calibration.bias) is not None:
         # Half of the variance: as large as all errors of measurement together.
         state = GOOD if not bias.found else DOUBTFUL if bias.ratio > 0.5 else NOTED
-        brief = f"{100 * bias.ratio:.0f} % of the residual variance are a bias"
+        brief = f"a bias makes up {100 * bias.ratio:.0f} % of the residual variance"
         findings.append(Finding("Bias", state, bias.sentence, brief))
     return findings
 

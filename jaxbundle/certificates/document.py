@@ -12,11 +12,6 @@ from jaxbundle.arguments import show
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.several import Calibrations
-from jaxbundle.calibration.verdict import (
-    conclude_calibration,
-    conclude_calibrations,
-    judge_cameras_and_rig,
-)
 from jaxbundle.certificates.acceptance import Acceptance, accept, length_test_of
 from jaxbundle.certificates.details import NO_DETAILS, CertificateDetails, read_details
 from jaxbundle.certificates.lengths import LengthTest
@@ -24,10 +19,8 @@ from jaxbundle.certificates.positional import PositionalAccuracy, positional_acc
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.reconstruction.page import conclude_part
 from jaxbundle.reconstruction.result import Reconstruction
 from jaxbundle.report.page import UNKNOWN, Origin
-from jaxbundle.report.verdict import Verdict, in_words
 from jaxbundle.results import ResultMethods
 
 
@@ -186,22 +179,6 @@ def _adjustments(result: Any) -> dict[str, Adjustment | Calibration]:
         "expected a result of jaxbundle.adjust, calibrate, calibrate_rig or reconstruct, got "
         f"{show(result)}"
     )
-
-
-def verdict_of(result: Any) -> Verdict:
-    """The verdict on a certified result, as its report states it."""
-    if isinstance(result, Calibration):
-        return conclude_calibration(result)
-    if isinstance(result, RigCalibration):
-        findings = tuple(judge_cameras_and_rig(result.cameras, result))
-        return Verdict(*in_words(list(findings), 0), findings)
-    if isinstance(result, Calibrations):
-        if len(result.cameras) == 1:
-            return conclude_calibration(next(iter(result.cameras.values())))
-        return conclude_calibrations(result)
-    if isinstance(result, Reconstruction):
-        return conclude_part(result, result.parts[0])
-    return result.verdict
 
 
 def _part(

@@ -20,6 +20,7 @@ from jaxbundle.certificates import positional
 from jaxbundle.certificates.acceptance import HEADER as ACCEPTANCE_HEADER
 from jaxbundle.certificates.details import FIELDS, WANTED
 from jaxbundle.certificates.positional import SUMMARY_HEADER
+from jaxbundle.certificates.result_verdict import verdict_of
 from jaxbundle.certificates.units import LENGTHS, convert
 from jaxbundle.io.results.gis import round_down
 from jaxbundle.network.columns import count
@@ -110,8 +111,6 @@ def find_cards(certificate: "Certificate") -> list[Card]:
         }[test.verdict]
         note = f"MPE {test.mpe.text or significant(test.mpe.constant)}" if test.mpe else ""
         cards.append(Card("Length measurement", verdict_words[0], note, verdict_words[1]))
-    from jaxbundle.certificates.document import verdict_of
-
     verdict = verdict_of(certificate.result)
     cards.append(Card("Tests", verdict.state, verdict.words, STATES.get(verdict.state, "")))
     if test is not None:

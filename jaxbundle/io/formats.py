@@ -46,7 +46,7 @@ from jaxbundle.io.networks.rig_result import (
     read_rig_line,
     read_rig_result,
 )
-from jaxbundle.io.networks.settings import choose_datum
+from jaxbundle.io.networks.settings import choose_datum, require_overrides
 from jaxbundle.io.networks.stereo import is_ros_stereo, read_ros_stereo
 from jaxbundle.io.networks.transforms import is_transforms, read_transforms
 from jaxbundle.io.output_formats import TARGETS
@@ -219,12 +219,7 @@ def read_network(
     **Raises:** `InputError`.
     """
     path = Path(given_path("path", path))
-    if isinstance(overrides, str) or not (
-        isinstance(overrides, Sequence) and all(isinstance(word, str) for word in overrides)
-    ):
-        raise InputError(
-            f"overrides must be a list of texts, such as ['datum=inner'], but is {show(overrides)}"
-        )
+    require_overrides(overrides)
     if format is not None and text("format", format) not in FORMATS:
         if format in TARGETS or format == "opencv":
             limitation = "contains only a camera" if format == "opencv" else "is written only"

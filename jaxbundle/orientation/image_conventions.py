@@ -84,7 +84,10 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     best = min(medians, key=lambda k: medians[k])  # The expected one, and simple ones, come first.
     if not explains_better(medians[best], medians[IDENTITY, False]):
         return ""
-    unit = get_model(network.cameras[0].model).unit
+    # As they were given: pixels may be of a camera in mm.
+    unit = network.image_unit
+    if unit not in EXPECTED_CONVENTION:
+        unit = get_model(network.cameras[0].model).unit
     x, y = ("u", "v") if unit == "px" else ("x", "y")
     words = []
     if best[1]:

@@ -19,7 +19,7 @@ from jaxbundle.adjustment.quality.projection_uncertainty import images_through_s
 from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.batches.calibrate_rigs import calibrate_rigs
 from jaxbundle.calibration import calibrate
-from jaxbundle.calibration.advice import advice, often_removed, suggest
+from jaxbundle.calibration.advice import advice, misfitting_views, often_removed, suggest
 from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.calibration.simulate import simulate_views
@@ -313,6 +313,14 @@ def test_what_is_missing_is_said():
         (suggestion,) = suggest(t, model, which)
         assert suggestion.startswith("not significant: k3 (t 0.4)")
     assert suggest(t, model, RICHER) == []
+
+
+def test_photographs_that_fit_worse_than_the_others_are_named():
+    rms = np.array([0.10, 0.12, 0.27, 0.11, np.nan, 0.35])
+    names = [f"{k}.jpg" for k in range(6)]
+    (said,) = misfitting_views(names, rms)
+    assert said.startswith("'5.jpg', '2.jpg': residuals up to 2.9 times")
+    assert not misfitting_views(names, np.full(6, 0.1)) and not misfitting_views(names, 0 * rms)
 
 
 def test_more_and_fewer_parameters_are_never_advised_together():

@@ -20,6 +20,7 @@ from jaxbundle.cameras import (
     turning_radius,
     validity_message,
 )
+from jaxbundle.cameras.coefficient_units import coefficient_unit
 from jaxbundle.cameras.field_of_view import field_of_view_of_rays
 
 
@@ -191,6 +192,11 @@ def own(function, names=N, **more):
     return CameraModel("mine", names, **({"correct": function} | more))
 
 
+def radial(p, x, y):
+    factor = 1 + p[2] * (x * x + y * y)
+    return x * factor, y * factor
+
+
 UNUSABLE = {
     "arguments": (own(lambda p: p), "correct.p, x, y. must take the parameters .c, x.*raised Type"),
     "number of parameters": (own(division, ("c", "x0")), "raised ValueError: not enough values"),
@@ -205,6 +211,11 @@ UNUSABLE = {
     ),
     "mirrored": (own(lambda p, x, y: (x, -y)), "mirrored or rotated.*axes 'up'"),
     "inverse": (own(division, inverse=lambda p, x, y: (x, y)), "inverse is not the inverse"),
+    # Right where the coefficient is zero, as at the start; its sign is wrong.
+    "inverse with coefficients": (
+        own(radial, ("c", "x0", "L2"), inverse=lambda p, x, y: radial((*p[:2], p[2]), x, y)),
+        "with parameters near them",
+    ),
 }  # fmt: skip
 
 
@@ -214,6 +225,19 @@ def test_a_formula_that_cannot_be_used_is_refused(case):
     values = {"c": 24.0, "x0": 0.0, "y0": 0.0, "L1": 1e-3, "L2": 0.0}
     with pytest.raises(ValueError, match=said):
         check_own(model, {name: values[name] for name in model.parameters})
+
+
+@pytest.mark.parametrize(
+    "model, units",
+    [
+        ("brown", {"K1": "mm⁻²", "K2": "mm⁻⁴", "K3": "mm⁻⁶", "P1": "mm⁻¹", "b1": ""}),
+        ("opencv", {"k1": "", "p1": "", "s1": ""}),
+    ],
+)
+def test_units_of_coefficients_follow_from_their_effect(model, units):
+    """Brown (1971) has coefficients of image lengths, OpenCV of ratios."""
+    found = {name: coefficient_unit(get_model(model), name) for name in units}
+    assert found == units
 
 
 @mine

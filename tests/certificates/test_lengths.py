@@ -124,6 +124,34 @@ def test_lengths_of_an_adjustment(field):
         length_errors(result, {"from": ["x"], "to": ["12"], "value": [1.0], "sigma": [1e-6]})
 
 
+def test_lengths_to_check_points_are_measured_and_those_between_control_not(field):
+    result, targets = field
+    pairs = [(6, 7), (7, 12), (0, 1), (2, 12)]
+    true = [float(np.linalg.norm(targets[a] - targets[b])) for a, b in pairs]
+    table = {
+        "from": [str(a + 1) for a, _ in pairs], "to": [str(b + 1) for _, b in pairs],
+        "value": true, "sigma": [1e-6] * 4,
+    }  # fmt: skip
+    test = length_errors(result, table, mpe="1 mm")
+    assert test.given == (("1", "2"),) and not test.missing
+    assert test.lengths.ends == (("7", "8"), ("8", "13"), ("3", "13"))
+    checks = dict(zip(result.check_points.id, result.check_points.position))
+    adjusted = dict(zip(result.points["id"], result.point_values))
+    expected = [
+        np.linalg.norm(checks["7"] - checks["8"]), np.linalg.norm(checks["8"] - adjusted["13"])
+    ]  # fmt: skip
+    np.testing.assert_allclose(test.measured[:2], expected)
+    assert (np.abs(test.error) < 5 * test.sigma).all() and test.verdict == CONFORMS
+    assert "not tested, both ends are control points: 1 – 2" in str(test)
+    # One that is missing leaves the verdict open, and is not accepted.
+    more = {name: [*values, value] for (name, values), value in zip(table.items(),
+            ("no", "13", 1.0, 1e-6))}  # fmt: skip
+    assert length_errors(result, more, mpe="1 mm").verdict == OPEN
+    assert not jaxbundle.accept(result, "LME < 1 mm", lengths=more).met
+    with pytest.raises(InputError, match="every length is between control points"):
+        length_errors(result, {"from": ["1"], "to": ["2"], "value": [1.0], "sigma": [1e-6]})
+
+
 def test_bad_tables_of_lengths():
     good = {"from": ["a"], "to": ["b"], "value": [1.0], "sigma": [0.0]}
     assert len(read_lengths(good)) == 1

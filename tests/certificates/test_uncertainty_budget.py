@@ -8,6 +8,7 @@ import pytest
 from adjustment_checks import linearise, synthetic
 
 import jaxbundle
+from jaxbundle.adjustment import uncertainty_budget as uncertainty_budget_module
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.budget_inputs import BudgetLine, HeldInput, Measurand
 from jaxbundle.adjustment.uncertainty_budget import (
@@ -185,6 +186,15 @@ def test_values_units_and_functions():
         uncertainty_budget(result, coverage=95)
     with pytest.raises(InputError, match="adjust or jaxbundle.calibrate"):
         uncertainty_budget(3)
+
+
+def test_independent_errors_of_size_zero_add_nothing(convergent4, monkeypatch):
+    """Where shared components explain all errors, the unit of weight must not stand for them."""
+    of_unit = uncertainty_budget(convergent4)
+    monkeypatch.setattr(uncertainty_budget_module, "image_scale", lambda _: (0.0, 23.0))
+    of_zero = uncertainty_budget(convergent4)
+    assert (of_unit.combined > 0).all()
+    np.testing.assert_array_equal(of_zero.combined, 0.0)
 
 
 @pytest.mark.further

@@ -11,6 +11,7 @@ from typing import Any
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap import fill_colmap, read_colmap
+from jaxbundle.io.networks.settings import require_overrides
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.network.tables import Network, require_network
 
@@ -24,6 +25,7 @@ def from_pycolmap(reconstruction: Any, overrides: Sequence[str] = ()) -> Network
 
     **Raises:** `InputError` for other objects, a reconstruction without images, and for settings.
     """
+    require_overrides(overrides)
     write = getattr(reconstruction, "write_binary", None)
     if write is None:
         raise InputError(f"expected a pycolmap.Reconstruction, got {type(reconstruction).__name__}")

@@ -31,6 +31,18 @@ ALL_CAMERAS = "*"
 Document = dict[str, Any]
 
 
+def require_overrides(overrides: Any) -> None:
+    """Refuse settings that are not a list of texts, such as one text, which is a list of letters.
+
+    **Raises:** `InputError`."""
+    if isinstance(overrides, str) or not (
+        isinstance(overrides, Sequence) and all(isinstance(word, str) for word in overrides)
+    ):
+        raise InputError(
+            f"overrides must be a list of texts, such as ['datum=inner'], but is {show(overrides)}"
+        )
+
+
 def choose_datum(overrides: Sequence[str]) -> bool:
     """Whether the settings of the command line choose the datum: then control of a file does not
     become the datum by itself."""
