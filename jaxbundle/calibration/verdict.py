@@ -51,7 +51,7 @@ def _judge_camera(name: str, calibration: "Calibration") -> Finding:
     about = f"Camera {name}"
     if not calibration.converged:
         return Finding(about, BAD, f"not solved: {calibration.adjustment.termination}")
-    return Finding(about, *conclude_calibration(calibration)[:2])
+    return Finding(about, *conclude_calibration(calibration)[:2], f"camera {name}")
 
 
 def _judge_rig(rig: "RigCalibration") -> Finding:

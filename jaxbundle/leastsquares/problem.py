@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Bool, Float, PyTree
 
-from jaxbundle.arguments import one_of
+from jaxbundle.arguments import one_of, show
 from jaxbundle.choices import REDUCTIONS
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
@@ -449,12 +449,25 @@ def complete_data(problem: Problem, data: Data | None) -> Data:
 
     **Raises:** `InputError` if the shapes differ."""
     planned, data = problem.data, problem.data if data is None else data
-    shapes = lambda data: (jax.tree.structure(data), [jnp.shape(x) for x in jax.tree.leaves(data)])
-    if shapes(data) != shapes(planned):
-        raise InputError("data must be a Data with arrays of the shapes of problem.data")
+    if not isinstance(data, Data):
+        raise InputError(f"data must be a Data, such as problem.data, but is {show(data)}")
+    shapes, planned_shapes = _shapes_by_name(data), _shapes_by_name(planned)
+    if shapes != planned_shapes:
+        names = dict.fromkeys([*planned_shapes, *shapes])
+        name = next(n for n in names if shapes.get(n) != planned_shapes.get(n))
+        raise InputError(
+            f"data{name}: expected {planned_shapes.get(name, 'nothing')}, as in problem.data, got "
+            f"{shapes.get(name, 'nothing')}"
+        )
     # Numbers of single precision are taken as they are, and adjusted in double precision.
     double = lambda x: x.astype(float) if isinstance(x, Tracer) else np.asarray(x, float)
     return pad_data(problem, jax.tree.map(double, data))
+
+
+def _shapes_by_name(data: Data) -> dict[str, tuple[int, ...]]:
+    """The shapes of all arrays, by names such as ".measured['image']"."""
+    leaves = jax.tree_util.tree_leaves_with_path(data)
+    return {jax.tree_util.keystr(path): jnp.shape(x) for path, x in leaves}
 
 
 def make_solver(

@@ -69,9 +69,13 @@ class Columns:
 
     def check_names(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
         """Refuse missing and unknown columns, and a table without rows."""
-        known_names = (*required, *optional)
+        known_names = tuple(dict.fromkeys((*required, *optional)))
         for name in self.values:
             if name not in known_names:
+                if name == "sigma" and {"sx", "sy"} <= {*known_names}:
+                    raise InputError(
+                        f"{self.source.name}: unknown column 'sigma'; σ have the columns sx and sy"
+                    )
                 raise InputError(
                     f"{self.source.name}: unknown column {name!r}{did_you_mean(name, known_names)}"
                 )

@@ -6,12 +6,13 @@ position: in the room, outside of obstacles, apart from the others.
 """
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbundle.arguments import at_least_zero, number, numeric_array, positive, show
+from jaxbundle.arguments import at_least_zero, number, numeric_array, show
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.types import Numbers
@@ -64,7 +65,8 @@ class Conditions:
         number("edge", self.edge, "a part of the format from 0, below 0.5", lambda x: 0 <= x < 0.5)
         at_least_zero("apart", self.apart)
         if self.incidence is not None:
-            positive("incidence", self.incidence)
+            right_angle = "an angle above 0, in radians, up to π/2"
+            number("incidence", self.incidence, right_angle, lambda x: 0 < x <= math.pi / 2)
             if self.normals is None:
                 raise InputError(
                     "incidence needs the normals of the targets: give normals, [P, 3] or one [3]"

@@ -25,6 +25,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxbundle.arguments import without_masks
+from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, rotate_back
 from jaxbundle.implicit import implicit_root, solve_dense
@@ -116,6 +117,8 @@ def project_points(
     positions outside the image by up to `margin` lines and pixels count as inside. Points inside
     the image are about ten times as fast as those outside, which must be searched for.
     """
+    if jnp.ndim(X) != 2 or jnp.shape(X)[0] != 3:  # noqa: PLR2004 - coordinates
+        raise InputError(f"X: expected the shape [3, n], coordinates first, got {jnp.shape(X)}")
     return _project_points(scanner_of(image), search, X, most, margin)
 
 

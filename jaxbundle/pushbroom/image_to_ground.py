@@ -81,5 +81,6 @@ def locate_points(
     lines: Float[AnyArray, " n"],
     pixels: Float[AnyArray, " n"],
 ) -> Float[Array, "3 n"]:
-    """The points of scattered image positions, with one pose each."""
+    """The points of scattered image positions, with one pose each; positions outside the image are
+    extrapolated."""
     return jnp.stack(jax.vmap(lambda l, u: locate_point(image, surface, l, u))(lines, pixels))

@@ -116,7 +116,7 @@ def first_facts(
         words = ", ".join(count(n, noun) for noun, n in number.items())
         if excluded := int(adjustment.problem.excluded.sum()):
             words += f" and with them {count(excluded, 'object point')}"
-        facts_said.append(f'{words} by data snooping: see there, and "removed" in the JSON')
+        facts_said.append(f'{words} by data snooping: see Data snooping, and "removed" in the JSON')
     return [*rows, *([("Left out", "; ".join(facts_said))] if facts_said else [])]
 
 

@@ -157,6 +157,14 @@ def test_positions_in_kilometres(tmp_path):
         read_scanner(path)
 
 
+def test_degrees_read_as_radians_are_refused(tmp_path):
+    """More than a turn: 12° are 1.9 turns if they are taken as radians."""
+    in_radians = TEXT.replace('name = "test"', 'name = "test"\nangle_unit = "rad"')
+    roll = f"roll = {float(np.degrees(-0.02))!r}"
+    with pytest.raises(InputError, match="roll is -12 rad.*are these degrees"):
+        read_scanner(write_scanner(tmp_path, in_radians.replace(roll, "roll = -12.0")))
+
+
 def test_a_camera_that_looks_up(tmp_path, command):
     """What the middle ray misses is said; figures of it are not known."""
     text = TEXT.replace(f"roll = {float(np.degrees(-0.02))!r}", "roll = 180")

@@ -55,6 +55,7 @@ refraction = true
 ```
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -177,8 +178,23 @@ def _options(section: TomlSection, method: str) -> dict[str, Any]:
 def mounting_of(file: TomlFile) -> tuple[float, float, float]:
     """Pitch, roll, yaw of the mounting in radians."""
     section = file.section("mounting")
-    pitch, roll, yaw = (file.radians * section.number(name, 0.0) for name in ANGLES)
+    angles = [file.radians * section.number(name, 0.0) for name in ANGLES]
+    for name, angle in zip(ANGLES, angles):
+        if abs(angle) > FULL_TURN:
+            raise InputError(f"{section.where}{_more_than_a_turn(name, angle)}")
+    pitch, roll, yaw = angles
     return pitch, roll, yaw
+
+
+# A turn, and a little for rounding: degrees read as radians are nearly always more.
+FULL_TURN = 2 * math.pi * 1.01
+
+
+def _more_than_a_turn(name: str, angle: float) -> str:
+    return (
+        f"{name} is {angle:.6g} rad, more than a full turn; are these degrees? Set [scanner] "
+        "angle_unit"
+    )
 
 
 def earth_of(scanner: TomlSection) -> Ellipsoid | None:
@@ -326,6 +342,10 @@ def _attitude(
         values, lengths = normalise_quaternions(values, columns.source)
     else:
         values = file.radians * values
+        if (is_more := np.abs(values) > FULL_TURN).any():
+            row, k = np.argwhere(is_more)[0].tolist()
+            why = _more_than_a_turn(names[k], float(values[row, k]))
+            raise InputError(f"{columns.source(row)}: {why}")
     if frame in ("GCRF", "J2000", "TEME"):
         if not quaternions:
             raise InputError(f"{section.where}frame {frame} needs quaternions; give q0, q1, q2, q3")
