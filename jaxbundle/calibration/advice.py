@@ -149,6 +149,16 @@ def misfitting_views(
     ]
 
 
+def many_not_used(used: int, not_used: int) -> list[str]:
+    """That more photographs are not used than are, in words."""
+    if not_used <= used:
+        return []
+    return [
+        f"{not_used} of {used + not_used} photographs are not used: is the board the one that they "
+        "show (--kind, --board)?"
+    ]
+
+
 def turns(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views"]:
     """The roll of every photograph about its line of sight, degrees: of the image's x axis in the
     plane of the board."""

@@ -15,6 +15,7 @@ from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import (
     ADVICE,
     advice,
+    many_not_used,
     misfitting_views,
     often_removed,
     suggest,
@@ -211,7 +212,11 @@ class Calibration(TableMethods):
             self.__dict__.get("cross_validation"),
         )
         images = self.adjustment.images
-        warnings = [*misfitting_views(images["id"].tolist(), images["rms"]), *warnings]
+        warnings = [
+            *many_not_used(len(self.views), len(self.views.failed)),
+            *misfitting_views(images["id"].tolist(), images["rms"]),
+            *warnings,
+        ]
         missed = self._missing_affinity
         if missed is not None and missed.missed:
             warnings = [*warnings, str(missed)]

@@ -14,6 +14,7 @@ from jaxbundle.calibration.rig.report import (
     correlation_rows,
     mounting_rows,
     mounting_titles,
+    rig_parameter_rows,
 )
 from jaxbundle.certificates import lengths as length_tests
 from jaxbundle.certificates import positional
@@ -223,6 +224,13 @@ def _ellipse_root(C: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
 
 def _results(certificate: "Certificate") -> Iterator[Section]:
     parts, number = [], 0
+    if certificate.rig is not None:
+        parts.append(
+            paragraph(
+                "Every camera by its separate calibration; by the common adjustment of the rig "
+                "they are under Mountings."
+            )
+        )
     for part in certificate.parts:
         parts += [f"<h3>{text(part.name)}</h3>\n"] if part.name else []
         if part.budget is None:
@@ -240,6 +248,13 @@ def _results(certificate: "Certificate") -> Iterator[Section]:
             )
         )
         budgeted = (part.adjustment for part in certificate.parts if part.budget is not None)
+        if any(part.adjustment.error_model is not None for part in certificate.parts):
+            parts.append(
+                paragraph(
+                    "σ of the report are larger than u, because they contain that the sizes of "
+                    "shared errors are estimates; here ν_eff and k contain it."
+                )
+            )
         if any(adjustment.assumes_independence for adjustment in budgeted):
             parts.append(paragraph(f"Standard uncertainties are {INDEPENDENCE}."))
         parts.append(_correlations(certificate))
@@ -266,10 +281,15 @@ def _rig(certificate: "Certificate") -> Iterator[Section]:
     parts.append(
         paragraph(
             f"Common adjustment: σ0 {rig.sigma0:.4f}, redundancy {rig.redundancy}, "
-            f"{count(len(rig.epochs), 'epoch')}. σ are standard uncertainties (k = 1). The budgets "
-            "below are of the separate calibration of every camera."
+            f"{count(len(rig.epochs), 'epoch')}. σ are standard uncertainties (k = 1). Results and "
+            "budgets are of the separate calibration of every camera."
         )
     )
+    rows = [(name, *row) for name in rig.stated_sigma for row in rig_parameter_rows(rig, name)]
+    parts += [
+        "<h3>Cameras by the common adjustment</h3>\n",
+        grid(("camera", "parameter", "value", "σ"), rows),
+    ]
     for title, m in mounting_titles(rig).items():
         parts += [
             f"<h3>{text(title)}</h3>\n",

@@ -19,7 +19,13 @@ from jaxbundle.adjustment.quality.projection_uncertainty import images_through_s
 from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.batches.calibrate_rigs import calibrate_rigs
 from jaxbundle.calibration import calibrate
-from jaxbundle.calibration.advice import advice, misfitting_views, often_removed, suggest
+from jaxbundle.calibration.advice import (
+    advice,
+    many_not_used,
+    misfitting_views,
+    often_removed,
+    suggest,
+)
 from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.calibration.simulate import simulate_views
@@ -321,6 +327,8 @@ def test_photographs_that_fit_worse_than_the_others_are_named():
     (said,) = misfitting_views(names, rms)
     assert said.startswith("'5.jpg', '2.jpg': residuals up to 2.9 times")
     assert not misfitting_views(names, np.full(6, 0.1)) and not misfitting_views(names, 0 * rms)
+    assert "19 of 21 photographs are not used" in many_not_used(2, 19)[0]
+    assert not many_not_used(12, 1)
 
 
 def test_more_and_fewer_parameters_are_never_advised_together():
