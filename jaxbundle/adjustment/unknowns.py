@@ -73,7 +73,10 @@ def value_of(problem: NetworkProblem, name: Name, values: Values):
     if name.kind == "point":
         p = place_of(name.id, network.points.id, "point")
         return values["point"][p, place_of(name.parameter, ("X", "Y", "Z"), "coordinate")]
-    raise KeyError(f"an unknown belongs to a camera, an image or a point, not a {name.kind!r}")
+    raise KeyError(
+        f"an unknown is of a 'camera', an 'image' or a 'point', not of {name.kind!r}: give its "
+        "kind, its id and its parameter"
+    )
 
 
 def angles_near(

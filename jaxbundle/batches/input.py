@@ -358,6 +358,11 @@ def _interior(
     names_given = [name for name in model.principal_distance if name in start]
     missing_names = [name for name in model.principal_distance if name not in start]
     held_names = [name for name in missing_names if name not in free]
+    if held_names and not names_given:
+        raise InputError(
+            f"{', '.join(held_names)} is held, without a value: add it to free, or give its start "
+            "value"
+        )
     if (names_given and missing_names) or held_names:
         raise InputError(f"start: give {', '.join(missing_names)} as well")
     number = f"a number, or one for each of {cameras} cameras"
