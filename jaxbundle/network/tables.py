@@ -19,9 +19,10 @@ from operator import index
 from typing import Any, SupportsIndex
 
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
-from jaxbundle.arguments import show
+from jaxbundle.arguments import refuse_traced, show
 from jaxbundle.cameras import CameraModel, get_model, key_of
 from jaxbundle.choices import ESTIMATED as ESTIMATED
 from jaxbundle.choices import SIGMA_ORIGINS as SIGMA_ORIGINS
@@ -108,9 +109,12 @@ def units_of(cameras: Iterable[Camera]) -> str:
 
 
 def _fill_masked(table: Any) -> None:
-    """Masked numbers become NaN, which the checks refuse with their row."""
+    """Masked numbers become NaN, which the checks refuse with their row. Arrays that JAX traces are
+    refused: tables are of the host."""
     for field in dataclasses.fields(table):
         value = getattr(table, field.name)
+        if isinstance(value, Tracer):
+            refuse_traced(f"{table.source.name}: {field.name}", value)
         if not isinstance(value, np.ma.MaskedArray):
             continue
         # A masked number is a missing one, NaN; an index or a flag cannot be missing.
