@@ -128,3 +128,20 @@ def test_what_does_not_fit_is_told(network, alone):
         jaxbundle.adjust(network, also=[ls.Table("point", np.zeros((2, 3)))])
     with pytest.raises(jaxbundle.InputError, match="also: expected tables .*"):
         jaxbundle.adjust(network, also=[3.0])
+
+
+@pytest.mark.parametrize(
+    "residual, why",
+    [
+        (lambda a: a, "it raised TypeError"),
+        (lambda a, b, m: {"x": 1.0}, "it returned"),
+        (lambda a, b, m: a.position - m, "it raised AttributeError"),
+    ],
+)
+def test_a_residual_that_cannot_be_evaluated_names_its_kind(network, residual, why):
+    bar = ls.Kind("bar", residual, of=("point", "point"))
+    observed = bar(rows=(["1"], ["2"]), measured=[1.0], sigma=0.1)
+    with pytest.raises(InputError, match=f"bar: .*row of point, point.*{why}"):
+        jaxbundle.adjust(network, also=[observed])
+    with pytest.raises(InputError, match="also must be a list"):
+        jaxbundle.adjust(network, also=observed)

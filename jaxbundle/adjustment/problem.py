@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.arguments import one_of
+from jaxbundle.arguments import one_of, show
 from jaxbundle.choices import REDUCTIONS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
@@ -263,6 +263,8 @@ def make_problem(
     require_x64()
     one_of("reduction", reduction, REDUCTIONS, allow_none=True)
     require_network(network)
+    if not isinstance(also, Sequence):
+        raise InputError(f"also must be a list of tables and observations, but is {show(also)}")
     network = order_cameras(split_check_points(network)[0])
     carries_datum, origin = _datum_points(network), None
     # Points at any distance are directions from the origin, which is then the mean of the

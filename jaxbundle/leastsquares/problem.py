@@ -378,11 +378,23 @@ def weights_of(
     def number(observation_set: ObservationSet) -> int:
         touched_tables = [table_of[name] for name in observation_set.kind.of]
         values, spaces = [t.value for t in touched_tables], tuple(t.space for t in touched_tables)
-        return len(
-            _evaluate.eval_shape(
-                observation_set.kind, spaces, one_row(values), one_row(observation_set.measured)
-            )
+        kind = observation_set.kind
+        expected = (
+            f"{kind.name}: its residual cannot be evaluated; expected a function of a row of "
+            f"{', '.join(kind.of)} and the measured value that returns a number, or a tuple or "
+            "array of them"
         )
+        try:
+            residuals = _evaluate.eval_shape(
+                kind, spaces, one_row(values), one_row(observation_set.measured)
+            )
+        except (TypeError, AttributeError, ValueError, IndexError) as error:
+            # The function of a user; its own message says where, this one which it is.
+            why = " ".join(str(error).split())
+            raise InputError(f"{expected}; it raised {type(error).__name__}: {why:.160}") from error
+        if not all(getattr(x, "shape", None) == () for x in residuals):
+            raise InputError(f"{expected}; it returned {show(residuals)}")
+        return len(residuals)
 
     return {
         observation_set.name: observation_set.weight(number(observation_set))
