@@ -35,7 +35,7 @@ from jaxbundle.leastsquares.quality.variance_components import (
     variance_components,
 )
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.network.blunders import Removed
+from jaxbundle.network.blunders import Removed, removed_rays
 
 # Iterates a changed problem from given values to its minimum; returns the problem as it ended.
 Minimise = Callable[[Problem, Values], tuple[NetworkProblem, Minimum]]
@@ -70,7 +70,7 @@ def snoop_network(
         scale = _scale_of_good(
             solution_with_all, _Repeat(minimise_again, "after data snooping", minimum)
         )
-        rays = sum(len(r.rows) for r in removed if r.kind == "image")
+        rays = len(removed_rays(removed))
         doubt = doubt_of_baarda(
             scale,
             rays,

@@ -96,9 +96,10 @@ def calibrate_batch(  # noqa: PLR0913 keyword arguments of a public function
     - `snooping`: `"pope"`: remove, camera by camera, blunders at the level `significance`, the
       probability of removing anything from a camera without blunders; before that, points more than
       one image size outside the image.
-    - `correlated`: also σ under errors that image points share, from the residuals of all cameras
-      (`"batch"`: cameras of one type and use) or of each by itself (`"camera"`), which shows errors
-      by view the less, the fewer views it has; eight of them or more.
+    - `correlated`: also σ under errors that image points share, of sizes common to all cameras
+      (`"batch"`: cameras of one type and use), from the residuals of up to 64 of them, spread over
+      the batch, or of each by itself (`"camera"`), which shows errors by view the less, the fewer
+      views it has; eight of them or more.
     - `threads`: portions solved at the same time on a CPU; default: the number of cores.
     - `progress(stage, done, total)`: called after every portion.
 

@@ -360,8 +360,7 @@ def _interior(
     held_names = [name for name in missing_names if name not in free]
     if held_names and not names_given:
         raise InputError(
-            f"{', '.join(held_names)} is held, without a value: add it to free, or give its start "
-            "value"
+            f"held without a value: {', '.join(held_names)}; free them, or give their start values"
         )
     if (names_given and missing_names) or held_names:
         raise InputError(f"start: give {', '.join(missing_names)} as well")

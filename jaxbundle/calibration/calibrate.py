@@ -40,6 +40,7 @@ from jaxbundle.leastsquares.quality.snooping import check_test
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards
+from jaxbundle.network.blunders import removed_rays
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import STATED, UNIT, UNSTATED_BOARD_SIGMA, Camera, Network
 from jaxbundle.orientation.pose import CameraPose
@@ -168,9 +169,8 @@ def _misfitting_views(views: BoardViews, result: Adjustment) -> Bool[np.ndarray,
     row_of = {name: row for row, name in enumerate(views.names)}
     names = result.problem.network.images.id
     removed = np.zeros(len(views), int)
-    for item in result.removed:
-        for ray in item.rows if item.kind == "image" else ():
-            removed[row_of[names[result.problem.image[ray]]]] += 1
+    for ray in removed_rays(result.removed):
+        removed[row_of[names[result.problem.image[ray]]]] += 1
     return removed > views.visible.sum(1) / 3
 
 

@@ -28,6 +28,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.display import print_anywhere
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.blunders import removed_rays
 from jaxbundle.network.tables import Camera
 from jaxbundle.report.correlated import has_field, stated_sigma_of
 from jaxbundle.report.lens_advice import advise_parameters, is_hardly_determined
@@ -222,13 +223,8 @@ class Calibration(TableMethods):
             warnings = [*warnings, str(missed)]
         # Image points are removed one by one: only counted by corner do they show a bad print.
         problem = self.adjustment.problem
-        removed_rows = [
-            row
-            for removal in self.adjustment.removed
-            if removal.kind == "image"
-            for row in removal.rows
-        ]
-        points = [problem.network.points.id[problem.point[row]] for row in removed_rows]
+        rays = removed_rays(self.adjustment.removed)
+        points = [problem.network.points.id[problem.point[ray]] for ray in rays]
         warnings += often_removed(points, len(problem.network.images))
         if self.bias is not None and self.bias.found:
             warnings = [*warnings, self.bias.sentence]

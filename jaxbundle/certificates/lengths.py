@@ -1,8 +1,8 @@
 """Length measurement errors: VDI/VDE 2634 Part 1, with a verdict after ISO 14253-1.
 
 Calibrated lengths that have no part in the adjustment are compared with those of its points, check
-points among them. Those between two control points have: coordinates that are given measure
-nothing.
+points among them. A length between two control points has a part: its ends are given, and it
+measures nothing.
 
     E = L_measured − L_calibrated                         VDI/VDE 2634-1 (2002): Δl = l_m − l_k
     MPE = min(A + L/K, B)                                 ISO 10360-2 (2009), forms of an MPE
@@ -167,8 +167,8 @@ class LengthTest(TableMethods):
 
     **Fields:** `lengths`, the calibrated ones that could be compared; `measured`, and `sigma` of
     it by the adjustment; `mpe`, None without; `rule`: "guard band" (ISO 14253-1) or "simple
-    acceptance"; `missing`: lengths whose points were not measured; `given`: those between control
-    points, which are not tested; `diagonal` of the measuring volume; `unit`.
+    acceptance"; `missing`: lengths whose points were not measured; `between_control`: those between
+    control points, which are not tested; `diagonal` of the measuring volume; `unit`.
     """
 
     lengths: CalibratedLengths
@@ -179,7 +179,7 @@ class LengthTest(TableMethods):
     mpe: PermissibleError | None = None
     rule: str = RULES[0]
     missing: tuple[tuple[str, str], ...] = ()
-    given: tuple[tuple[str, str], ...] = ()
+    between_control: tuple[tuple[str, str], ...] = ()
 
     @property
     def error(self) -> Float[np.ndarray, " n"]:
@@ -313,7 +313,7 @@ class LengthTest(TableMethods):
             "rule": self.rule,
             "verdict": self.verdict or None,
             "missing": [list(ends) for ends in self.missing],
-            "given": [list(ends) for ends in self.given],
+            "between_control": [list(ends) for ends in self.between_control],
             "lengths": [dict(zip(columns, row)) for row in zip(*columns.values())],
         }
 
@@ -326,8 +326,8 @@ class LengthTest(TableMethods):
         ]
         if self.missing:
             lines.append(f"not measured: {list_some(self.missing, 5, ' – '.join)}")
-        if self.given:
-            names = list_some(self.given, 5, " – ".join)
+        if self.between_control:
+            names = list_some(self.between_control, 5, " – ".join)
             lines.append(f"not tested, both ends are control points: {names}")
         return "\n".join(lines)
 
@@ -384,8 +384,7 @@ def length_errors(
     _refuse_observed(adjustment, calibrated)
     points = adjustment.problem.network.points
     is_control = points.has_role("control", "fixed")
-    control = {id for id, is_given in zip(points.id, is_control) if is_given}
-    given_lengths = tuple(ends for ends in calibrated.ends if control.issuperset(ends))
+    control = {id for id, is_of_control in zip(points.id, is_control) if is_of_control}
     rows_measured = [
         i for i, ends in enumerate(calibrated.ends) if all(end in known_points for end in ends)
     ]
@@ -396,7 +395,10 @@ def length_errors(
             f"{calibrated.source}: no length has both points in the result; missing are "
             f"{list_some(names)}"
         )
-    testable = [i for i in rows_measured if calibrated.ends[i] not in given_lengths]
+    between_control = tuple(
+        calibrated.ends[i] for i in rows_measured if control.issuperset(calibrated.ends[i])
+    )
+    testable = [i for i in rows_measured if calibrated.ends[i] not in between_control]
     if not testable:
         raise InputError(
             f"{calibrated.source}: every length is between control points, whose coordinates are "
@@ -421,7 +423,7 @@ def length_errors(
         limit,
         rule,
         missing,
-        given_lengths,
+        between_control,
     )
 
 
@@ -455,13 +457,15 @@ def _sigma_of_lengths(
         variance[is_adjusted] = variances
     if not is_adjusted.all():
         checks = not_none(adjustment.check_points)
-        blocks = dict(zip(row_of, adjustment.point_covariance)) | dict(
-            zip(checks.id, checks.covariance)
-        )
+        # By the point the covariances of which the larger is stated.
+        covariances = zip(adjustment.classical_point_covariance, adjustment.point_covariance)
+        blocks = dict(zip(row_of, covariances))
+        blocks |= {id: (C, C) for id, C in zip(checks.id, checks.covariance)}
         for i in np.flatnonzero(~is_adjusted):
             difference = ends[i, 1] - ends[i, 0]
             along = difference / np.linalg.norm(difference)
-            variance[i] = along @ sum(blocks[end] for end in lengths.ends[i]) @ along
+            both_ends = (blocks[end] for end in lengths.ends[i])
+            variance[i] = sum(max(along @ C @ along for C in of_end) for of_end in both_ends)
     return np.sqrt(np.clip(variance, 0, None))
 
 
@@ -510,5 +514,7 @@ def join_length_tests(tests: Sequence[LengthTest] | Mapping[str, LengthTest]) ->
         sigma=np.concatenate([t.sigma for t in repetitions]),
         diagonal=max(t.diagonal for t in repetitions),
         missing=tuple(dict.fromkeys(ends for t in repetitions for ends in t.missing)),
-        given=tuple(dict.fromkeys(ends for t in repetitions for ends in t.given)),
+        between_control=tuple(
+            dict.fromkeys(ends for t in repetitions for ends in t.between_control)
+        ),
     )

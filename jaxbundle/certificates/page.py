@@ -251,8 +251,8 @@ def _results(certificate: "Certificate") -> Iterator[Section]:
         if any(part.adjustment.error_model is not None for part in certificate.parts):
             parts.append(
                 paragraph(
-                    "σ of the report are larger than u, because they contain that the sizes of "
-                    "shared errors are estimates; here ν_eff and k contain it."
+                    "The sizes of shared errors are estimates. That makes σ in the report larger; "
+                    "here it is in ν_eff and k, and not in u."
                 )
             )
         if any(adjustment.assumes_independence for adjustment in budgeted):
@@ -383,8 +383,8 @@ def lengths_section(test: "LengthTest") -> Section:
     if test.missing:
         ends = [" – ".join(ends_of_length) for ends_of_length in test.missing]
         parts += ["<h3>Not measured</h3>\n", items(ends)]
-    if test.given:
-        ends = [" – ".join(ends_of_length) for ends_of_length in test.given]
+    if test.between_control:
+        ends = [" – ".join(ends_of_length) for ends_of_length in test.between_control]
         parts += ["<h3>Not tested: both ends are control points</h3>\n", items(ends)]
     title = "Length measurement errors (VDI/VDE 2634-1)"
     return Section("lengths", title, "".join(parts), "Length errors")

@@ -252,17 +252,8 @@ def _rms_sigma(subject: Subject, argument: str) -> QuantityValues:
 
 def _image_rms(subject: Subject, _: str) -> QuantityValues:
     adjustment: Adjustment = subject.result
-    rows = adjustment.residuals
-    image = rows["kind"] == "image"
-    # Two coordinates a point: the RMS of a coordinate.
-    unit = str(rows["unit"][image][0])
-    cameras = adjustment.problem.network.cameras
-    pitch = _pitch(cameras)
-    v = rows["v"][image]
-    scale = {"µm": 1e-3, "um": 1e-3}.get(unit)
-    if scale is not None:
-        v, unit = v * scale, "mm"
-    return QuantityValues({"": float(np.sqrt(np.mean(v**2)))}, unit, pitch)
+    pitch = _pitch(adjustment.problem.network.cameras)
+    return QuantityValues({"": adjustment.image_rms}, adjustment.image_unit, pitch)
 
 
 def _differences(result: Adjustment) -> CheckDifferences | None:

@@ -1,7 +1,7 @@
 """Observations that data snooping removed, and suspects of robust estimation, in network terms."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +20,11 @@ class Removed:
     def rows(self) -> tuple[int, ...]:
         """All rows that were removed."""
         return (self.row, *self.others)
+
+
+def removed_rays(removed: Iterable[Removed]) -> list[int]:
+    """The rows of all image points that were removed."""
+    return [ray for item in removed if item.kind == "image" for ray in item.rows]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.leastsquares.quality.global_test import describe_test
+from jaxbundle.network.blunders import removed_rays
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.tables import ESTIMATED, ROLES, STATED, UNIT
@@ -110,14 +111,14 @@ def first_facts(
     left_out = left_out_in_words(adjustment)
     facts_said = [f"{left_out}: see Notes, and left_out in the JSON"] if left_out else []
     if removals := adjustment.removed:
-        number: Counter[str] = Counter()
-        for item in removals:
-            number["image point" if item.kind == "image" else "other observation"] += len(item.rows)
-        words = ", ".join(count(n, noun) for noun, n in number.items())
+        rays = len(removed_rays(removals))
+        others = sum(len(item.rows) for item in removals) - rays
+        numbers = ((rays, "image point"), (others, "other observation"))
+        words = ", ".join(count(n, noun) for n, noun in numbers if n)
         if excluded := int(adjustment.problem.excluded.sum()):
             words += f" and with them {count(excluded, 'object point')}"
         facts_said.append(f'{words} by data snooping: see Data snooping, and "removed" in the JSON')
-    return [*rows, *([("Left out", "; ".join(facts_said))] if facts_said else [])]
+    return [*rows, ("Left out", "; ".join(facts_said))] if facts_said else rows
 
 
 def left_out_in_words(adjustment: "Adjustment") -> str:

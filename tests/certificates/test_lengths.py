@@ -133,7 +133,7 @@ def test_lengths_to_check_points_are_measured_and_those_between_control_not(fiel
         "value": true, "sigma": [1e-6] * 4,
     }  # fmt: skip
     test = length_errors(result, table, mpe="1 mm")
-    assert test.given == (("1", "2"),) and not test.missing
+    assert test.between_control == (("1", "2"),) and not test.missing
     assert test.lengths.ends == (("7", "8"), ("8", "13"), ("3", "13"))
     checks = dict(zip(result.check_points.id, result.check_points.position))
     adjusted = dict(zip(result.points["id"], result.point_values))
