@@ -306,7 +306,7 @@ def test_angles_come_back_on_the_branch_they_were_given(simulation, result):
     (("image", "1", "Phi"), "there is no image parameter 'Phi'; did you mean 'phi'"),
     (("point", "x", "X"), "there is no point 'x'"),
     (("point", "8", "x"), "there is no coordinate 'x'; did you mean 'X'"),
-    (("station", "8", "X"), "to a camera, an image or a point"),
+    (("station", "8", "X"), "a .camera., an .image. or a .point., not of .station."),
 ])  # fmt: skip
 def test_an_unknown_of_no_such_name(result, name, said):
     with pytest.raises(KeyError, match=said):
