@@ -36,7 +36,6 @@ from jaxbundle.io.networks.colmap import fill_colmap
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
-from jaxbundle.io.networks.rig_result import IN_BOARD_UNITS
 from jaxbundle.io.networks.stereo import ROS_FILES
 from jaxbundle.io.output_formats import TARGETS
 from jaxbundle.io.text.csv_tables import write_text
@@ -72,6 +71,8 @@ RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "ros-stereo": ("camera_info", ROS_FILES),
     "anipose": ("calibration.toml", ()),
 }
+# Those that have metres; the others keep the unit of the board.
+IN_METRES = ("kalibr", "mrcal", "ros-stereo")
 STEREO_PAIRS = "stereo_*.yaml"
 # Models that OpenCV and COLMAP have.
 FOREIGN = ("opencv", "kannala-brandt")
@@ -243,7 +244,7 @@ def fill_rig(network: Network, folder: Path) -> None:
     """Write a rig for other programs: Kalibr, mrcal, and in pairs of cameras OpenCV and ROS. What a
     program cannot hold is fitted, or left out; both are said in `conversions.txt`."""
     folder.mkdir(exist_ok=True)
-    conversion_lines = [IN_BOARD_UNITS]
+    conversion_lines = [_lengths_of_rig(network)]
     for kind, (name, _) in RIG_FILES.items():
         target, refusal = TARGETS[kind], ""
         # As it is, else with the models that the format has, its best one first.
@@ -272,6 +273,15 @@ def fill_rig(network: Network, folder: Path) -> None:
         else:
             conversion_lines.append(refusal)
     write_text(folder / CONVERSIONS, "".join(f"{line}\n" for line in conversion_lines))
+
+
+def _lengths_of_rig(network: Network) -> str:
+    """In which units the lengths of the files are, and what makes a wrong one noticed."""
+    unit, (reference, *others) = network.object_unit, network.images.id
+    bases = np.linalg.norm(network.images.position - network.images.position[0], axis=1)[1:]
+    distances = ", ".join(f"{name!r} {base:.4g} {unit}" for name, base in zip(others, bases))
+    in_metres = ", ".join(name for kind, (name, _) in RIG_FILES.items() if kind in IN_METRES)
+    return f"distances from {reference!r}: {distances}; {in_metres}: in metres, others in {unit}"
 
 
 def fill_comparison(

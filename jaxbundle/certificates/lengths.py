@@ -36,13 +36,14 @@ from jaxtyping import Array, Float
 from jaxbundle.adjustment.problem import coordinates
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import at_least_zero, one_of, positive, show
-from jaxbundle.certificates.units import LENGTHS, convert
+from jaxbundle.certificates.units import convert
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.network.columns import as_columns, count, did_you_mean, list_some
+from jaxbundle.network.units import METRES
 from jaxbundle.report.layout import fixed, significant, table
 from jaxbundle.results import TableMethods
 from jaxbundle.types import not_none
@@ -92,7 +93,7 @@ def read_mpe(text: str, unit: str) -> PermissibleError:
         raise InputError(
             f"MPE {show(text)}: expected A UNIT + L/K, such as '20 um + L/50000', or '50 um'"
         )
-    if unit not in LENGTHS:
+    if unit not in METRES:
         raise InputError(f"MPE {text!r}: the object unit {unit!r} is no length")
     try:
         constant = convert(float(match["a"]), match["unit"].replace("µ", "u"), unit)

@@ -22,9 +22,10 @@ from jaxbundle.certificates.acceptance import HEADER as ACCEPTANCE_HEADER
 from jaxbundle.certificates.details import FIELDS, WANTED
 from jaxbundle.certificates.positional import SUMMARY_HEADER
 from jaxbundle.certificates.result_verdict import verdict_of
-from jaxbundle.certificates.units import LENGTHS, convert
+from jaxbundle.certificates.units import convert
 from jaxbundle.io.results.gis import round_down
 from jaxbundle.network.columns import count
+from jaxbundle.network.units import METRES
 from jaxbundle.report import head, observations
 from jaxbundle.report.correlated import INDEPENDENCE
 from jaxbundle.report.layout import clean, column_decimals, fixed, significant
@@ -151,7 +152,7 @@ def _figures(part: "CertifiedPart") -> list[Card]:
 
 def readable_length(value: float, unit: str) -> str:
     """A length in km, m, mm or µm, whichever has one to three digits before the point."""
-    if unit not in LENGTHS or not np.isfinite(value) or value == 0:
+    if unit not in METRES or not np.isfinite(value) or value == 0:
         return f"{significant(value)} {clean(unit)}"
     best = next((u for u in ("km", "m", "mm", "um") if abs(convert(value, unit, u)) >= 1), "um")
     return f"{significant(convert(value, unit, best))} {best.replace('um', 'µm')}"

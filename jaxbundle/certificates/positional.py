@@ -22,10 +22,11 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import positive, show
-from jaxbundle.certificates.units import LENGTHS, convert, kind_of
+from jaxbundle.certificates.units import convert, kind_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count
+from jaxbundle.network.units import METRES
 from jaxbundle.report.layout import fixed, significant, table
 from jaxbundle.results import TableMethods
 from jaxbundle.types import not_none
@@ -163,7 +164,7 @@ class PositionalAccuracy(TableMethods):
         return sentences
 
     def _centimetres(self, value: float) -> str:
-        if self.unit not in LENGTHS:
+        if self.unit not in METRES:
             return f"{significant(value)} {self.unit}"
         return f"{significant(convert(value, self.unit, 'cm'))} cm"
 

@@ -23,7 +23,7 @@ from jaxbundle.network.kinds.robot_poses import PARTS
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.refinement import Refinement
 
-METRES = "m"
+METRE = "m"
 
 
 def unknown_quantity(name: str, forms: Sequence[str]) -> str:
@@ -116,7 +116,7 @@ OF_HAND_EYE: tuple[Quantity, ...] = (
 
 def _differences(result: Refinement) -> CheckDifferences | None:
     check = result.check
-    return None if check is None else CheckDifferences(check.id, check.difference, METRES)
+    return None if check is None else CheckDifferences(check.id, check.difference, METRE)
 
 
 def _point_sigma(subject: Subject, argument: str) -> QuantityValues:
@@ -127,7 +127,7 @@ def _point_sigma(subject: Subject, argument: str) -> QuantityValues:
     }
     if not sigma_of_points:
         raise LookupError(f"no {argument} of a point is estimated")
-    return QuantityValues(sigma_of_points, METRES)
+    return QuantityValues(sigma_of_points, METRE)
 
 
 OF_REFINEMENT: tuple[Quantity, ...] = (

@@ -4,21 +4,8 @@ import math
 from typing import NamedTuple
 
 from jaxbundle.errors import InputError
+from jaxbundle.network.units import METRES
 
-LENGTHS = {
-    "nm": 1e-9,
-    "um": 1e-6,
-    "µm": 1e-6,
-    "μm": 1e-6,
-    "mm": 1e-3,
-    "cm": 1e-2,
-    "dm": 1e-1,
-    "m": 1.0,
-    "km": 1e3,
-    "in": 0.0254,
-    "ft": 0.3048,
-    "ftUS": 1200 / 3937,
-}
 ANGLES = {
     "rad": 1.0,
     "mrad": 1e-3,
@@ -31,7 +18,7 @@ ANGLES = {
 }
 RATIOS = {"": 1.0, "%": 1e-2, "ppm": 1e-6}
 PIXELS = {"px": 1.0, "mpx": 1e-3}
-KINDS = {"length": LENGTHS, "angle": ANGLES, "number": RATIOS, "image": PIXELS}
+KINDS = {"length": METRES, "angle": ANGLES, "number": RATIOS, "image": PIXELS}
 
 
 class PixelPitch(NamedTuple):
@@ -60,8 +47,8 @@ def convert(value: float, from_unit: str, to_unit: str, pitch: PixelPitch = NO_P
         return value * units[from_unit] / units[to_unit]
     if {*kinds} == {"length", "image"} and pitch.mm is not None:
         if kinds[0] == "image":
-            return value * PIXELS[from_unit] * pitch.mm * 1e-3 / LENGTHS[to_unit]
-        return value * LENGTHS[from_unit] / (pitch.mm * 1e-3) / PIXELS[to_unit]
+            return value * PIXELS[from_unit] * pitch.mm * 1e-3 / METRES[to_unit]
+        return value * METRES[from_unit] / (pitch.mm * 1e-3) / PIXELS[to_unit]
     raise InputError(_refusal(from_unit, to_unit))
 
 

@@ -29,6 +29,22 @@ ANGLE_UNITS: dict[str, float] = dict(
     zip(ANGLE_UNIT_NAMES, (1.0, math.pi / 180, math.pi / 200), strict=True)
 )
 
+# Metres in one unit of length; "ftUS" is the survey foot.
+METRES: dict[str, float] = {
+    "nm": 1e-9,
+    "um": 1e-6,
+    "µm": 1e-6,
+    "μm": 1e-6,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "dm": 1e-1,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+    "ftUS": 1200 / 3937,
+}
+
 IMAGE_UNITS = ("mm", "px")
 
 

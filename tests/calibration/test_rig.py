@@ -110,7 +110,7 @@ def test_a_rig_leaves_the_program(both, rig, tmp_path):
     fill_rig(rig.network(), tmp_path / "rig")
     (tmp_path / "result.json").write_text(json_text(both.to_dict(True)))
     said = (tmp_path / "rig" / "conversions.txt").read_text()
-    assert "unit of the board" in said and "not written" not in said
+    assert "distances from 'left': 'right'" in said and "not written" not in said
     flip, mounting = np.diag([1.0, -1, -1]), rig.mountings["right"]
     for name, file in (("stereo.yaml", ""), ("mrcal", "right.cameramodel"),
                        ("camera_info", "right.yaml")):  # fmt: skip

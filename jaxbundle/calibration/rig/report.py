@@ -217,6 +217,7 @@ def rig_dict(rig: "RigCalibration", brief: bool = False) -> dict:
     residuals = [dict(zip(residual_columns, row)) for row in table_rows(residual_columns)]
     return {
         "reference": rig.names[0],
+        "unit": rig.object_unit,
         "epochs": list(rig.epochs),
         "left_out": dict(rig.left_out),
         "contradicting": dict(rig.contradicting),

@@ -407,6 +407,7 @@ class RigCalibration(TableMethods):
             cameras,
             [np.eye(3), *(mounting.rotation for mounting in mountings)],
             [np.zeros(3), *(mounting.base for mounting in mountings)],
+            self.object_unit,
         )
 
     @property

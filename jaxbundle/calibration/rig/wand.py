@@ -105,6 +105,7 @@ class WandCalibration(TableMethods):
             adjusted,
             [np.eye(3), *(mounting.rotation for mounting in mountings)],
             [np.zeros(3), *(mounting.base for mounting in mountings)],
+            self.adjustment.network.object_unit,
         )
 
     def table(self) -> dict[str, np.ndarray]:

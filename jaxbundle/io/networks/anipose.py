@@ -91,7 +91,7 @@ def read_anipose(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     ]
     poses = [_pose(camera_fields) for camera_fields in fields]
     R, t = zip(*poses)
-    return rig_network(path, cameras, R, t, overrides, unknown.messages())
+    return rig_network(path, cameras, R, t, overrides, unknown.messages(), unit="model")
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:

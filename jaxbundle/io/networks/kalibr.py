@@ -45,6 +45,7 @@ from jaxbundle.io.networks.losses import (
     changed,
     describe_losses,
     losing,
+    mountings_in_metres,
     need_values,
     size_of,
 )
@@ -241,13 +242,14 @@ def _camera(id: str, fields: JsonFields) -> Camera:
 
 
 def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
-    """Write the cameras of a network, named cam0, cam1, …, with the mountings of a rig.
+    """Write the cameras of a network, named cam0, cam1, …, with the mountings of a rig, in metres.
 
     **Returns:** messages about what the format cannot hold.
 
     **Raises:** `InputError` for a camera without a model in Kalibr, or without image size.
     """
-    mountings, lines, losses = mountings_of(network), [], []
+    network, losses = mountings_in_metres(network, "Kalibr")
+    mountings, lines = mountings_of(network), []
     if mountings is None and len(network.cameras) > 1:
         losses.append("mountings of the cameras")
     for k, original in enumerate(network.cameras):

@@ -5,6 +5,7 @@ network has of it. The command tells this before it writes, the table of convers
 documentation is made of it, and a test compares it with what is read back.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
@@ -14,6 +15,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.network.kinds import KINDS
 from jaxbundle.network.tables import UNIT, Camera, Network
+from jaxbundle.network.units import METRES
 
 # Camera models common to formats of computer vision.
 PIXEL_MODELS = ("opencv", "kannala-brandt")
@@ -43,6 +45,21 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
                 f"{table.source(row)}: {name} {table.id[row]!r} has no {quantity} to be written: "
                 "convert the result of jaxbundle orient or adjust, which compute what is missing"
             )
+
+
+def mountings_in_metres(network: Network, format: str) -> tuple[Network, list[str]]:
+    """A network with the positions of its images in metres, for a format whose lengths are metres,
+    and what has to be said of a unit that is no length."""
+    images, unit = network.images, network.object_unit
+    if unit in METRES:
+        images = dataclasses.replace(images, position=METRES[unit] * images.position)
+        return network.replace(images=images, object_unit="m"), []
+    known = np.isfinite(images.position) & (images.position != 0)
+    remark = (
+        f"the unit of lengths: {format} expects metres, and those of the network, in {unit!r}, are "
+        "written as they are (if they are millimetres, say --set object_unit=mm)"
+    )
+    return network, [remark] if known.any() else []
 
 
 # How many of something a network has.

@@ -49,7 +49,13 @@ from jaxbundle.io.networks.assemble import (
     foreign_document,
     image_columns,
 )
-from jaxbundle.io.networks.losses import describe_losses, losing, need_values, size_of
+from jaxbundle.io.networks.losses import (
+    describe_losses,
+    losing,
+    mountings_in_metres,
+    need_values,
+    size_of,
+)
 from jaxbundle.io.networks.poses import (
     matrices_of,
     matrices_of_rotation_vectors,
@@ -234,7 +240,7 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
 
 
 def write_mrcal(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:
-    """Write the cameras of a network into a folder, a `.cameramodel` for every image.
+    """Write the cameras of a network into a folder, a `.cameramodel` for every image, in metres.
 
     **Arguments:** `force`: also replace a folder not written by this function.
 
@@ -250,6 +256,7 @@ def write_mrcal(network: Network, folder: str | Path, force: bool = False) -> tu
 def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     """Write camera models into an existing folder or a new one; as `write_mrcal`."""
     need_values(network, points=False)
+    network, losses = mountings_in_metres(network, "mrcal")
     images = network.images
     R, t = cv_pose(matrices_of(images.angles), images.position)
     rt = np.concatenate([rotation_vectors_of(R), t], 1)
@@ -263,7 +270,7 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, texts):
         write_text(folder / f"{name}{SUFFIX}", text)
-    return describe_losses(network, MRCAL_LOSSES)
+    return (*describe_losses(network, MRCAL_LOSSES), *losses)
 
 
 # What it loses; every image is a file with a camera.

@@ -162,7 +162,9 @@ def read_opencv_rig(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     else:
         cameras, poses = _read_nested(path, document, unknown)
     messages = (*fit_messages(cameras), *unknown.messages())
-    return rig_network(path, cameras, *zip(*poses), overrides, messages)  # type: ignore[arg-type]
+    R, t = zip(*poses)
+    # The unit is that of the board, which the file does not say.
+    return rig_network(path, cameras, R, t, overrides, messages, unit="model")
 
 
 def _read_pair(

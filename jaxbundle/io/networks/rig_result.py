@@ -1,7 +1,7 @@
 """The rig in the JSON of `jaxbundle calibrate --rig`, or a line of `jaxbundle batch`: cameras, and
 their mountings. In the JSON
 
-    rig.reference                           the camera without a mounting
+    rig.reference, rig.unit                 the camera without a mounting; the unit of lengths
     rig.mountings.CAMERA.base, rotation     projection centre in the frame of the reference camera,
                                             and R from its frame to that of the camera
     rig.cameras.CAMERA.PARAMETER.value      of the joint adjustment
@@ -40,11 +40,9 @@ from jaxbundle.system.file_content import beginning, parse_json
 
 # A file of lines, and the key of one of them, which may have a # itself.
 LINE = re.compile(r"(.+\.jsonl)(?:#(.+))?", re.S)
+# Of results that do not say theirs.
 UNIT = "model"
 REFERENCE = {"base": [0, 0, 0], "rotation": np.eye(3).tolist()}
-IN_BOARD_UNITS = (
-    "lengths of the mountings are in the unit of the board; Kalibr, ROS and mrcal expect metres"
-)
 
 
 def is_rig_result(path: Path) -> bool:
@@ -107,7 +105,7 @@ def read_rig_line(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
         raise InputError(f"{where}: not a line of jaxbundle batch --rig: {problem}") from None
-    return network_of_rig(file, cameras, rotations, bases, overrides)
+    return network_of_rig(file, cameras, rotations, bases, overrides=overrides)
 
 
 def _rows(file: Path) -> Iterator[dict[str, Any]]:
@@ -150,7 +148,8 @@ def read_rig_result(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(f"{path}: not the result of calibrate --rig: {problem}") from None
     for rotation in rotations:
         check_rotations(rotation, f"{path}: rig.mountings, rotation")
-    return network_of_rig(path, cameras, rotations, bases, overrides)
+    unit = rig.get("unit", UNIT)
+    return network_of_rig(path, cameras, rotations, bases, unit, overrides)
 
 
 def network_of_rig(
@@ -158,16 +157,18 @@ def network_of_rig(
     cameras: Sequence[Camera],
     rotations: Sequence[Float[np.ndarray, "3 3"]],
     bases: Sequence[Float[np.ndarray, "3"]],
+    unit: str = UNIT,
     overrides: Sequence[str] = (),
 ) -> Network:
-    """The network of cameras on mountings, as of `calibration.rig.result.Mounting`.
+    """The network of cameras on mountings, as of `calibration.rig.result.Mounting`; `unit`: of
+    their bases.
 
     X_k = R·(X − b) in our frames is x_k = (D·R·D)·x − D·R·b in those with y down, z forward.
     """
     flip = np.diag(D)
     R = [flip @ rotation @ flip for rotation in rotations]
     t = [-flip @ rotation @ base for rotation, base in zip(rotations, bases)]
-    return rig_network(path, cameras, R, t, overrides, warnings=[IN_BOARD_UNITS], unit=UNIT)
+    return rig_network(path, cameras, R, t, overrides, unit=unit)
 
 
 def _camera(

@@ -37,7 +37,7 @@ from jaxbundle.io.cameras.opencv_writing import file_text, opencv_entries, ros_t
 from jaxbundle.io.cameras.ros_ini import is_ros_ini_pair, read_ros_sections
 from jaxbundle.io.networks.assemble import all_parameters, rig_network
 from jaxbundle.io.networks.kalibr import mounted_losses, mountings_of
-from jaxbundle.io.networks.losses import describe_losses, size_of
+from jaxbundle.io.networks.losses import describe_losses, mountings_in_metres, size_of
 from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.text.csv_tables import write_texts
 from jaxbundle.network.tables import Camera, Network
@@ -223,11 +223,12 @@ def ros_stereo_folders(network: Network, folder: Path) -> tuple[Path, ...]:
 
 
 def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
-    """Write two cameras as ROS's camera_info, NAME.yaml each, rectified with each other; of a rig
-    of more cameras a folder FIRST_CAMERA a pair.
+    """Write two cameras as ROS's camera_info, NAME.yaml each, rectified with each other, in metres;
+    of a rig of more cameras a folder FIRST_CAMERA a pair.
 
     **Returns, raises:** as `write_opencv_stereo`; `InputError` if no pair can be rectified.
     """
+    network, losses = mountings_in_metres(network, "ROS")
     pairs = _pairs(network, "a pair of ROS")
     texts, failures = {}, []
     for pair in pairs:
@@ -244,7 +245,7 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
     for file in texts:
         file.parent.mkdir(parents=True, exist_ok=True)
     write_texts([*texts], [*texts.values()])
-    return (*describe_losses(network, STEREO_LOSSES), *failures)
+    return (*describe_losses(network, STEREO_LOSSES), *losses, *failures)
 
 
 def is_ros_stereo(path: Path) -> bool:
