@@ -1,8 +1,10 @@
 """Adjustments saved, loaded and compared: nothing is lost, and differences have the σ they vary
 with."""
 
+import copy
 import dataclasses
 import json
+import pickle
 
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +56,13 @@ def test_a_loaded_adjustment_has_all_that_the_saved_one_has(network, tmp_path, o
     name = ("camera", "cam", "c"), ("point", "7", "Z")
     assert again.covariance(*name) == pytest.approx(result.covariance(*name), rel=1e-9)
     assert (again.fingerprint, again.warnings) == (result.fingerprint, result.warnings)
+
+
+def test_a_pickled_adjustment_is_the_saved_one(network):
+    result = jaxbundle.adjust(network)
+    again = pickle.loads(pickle.dumps(result))
+    assert again.report() == result.report()
+    assert copy.copy(result).report() == copy.deepcopy(result).report() == result.report()
 
 
 @pytest.mark.further

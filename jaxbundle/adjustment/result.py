@@ -40,7 +40,7 @@ from jaxbundle.adjustment.quality.replication import (
 )
 from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.adjustment.quality.weakness import Weakness, weakness
-from jaxbundle.adjustment.saved_state import network_fingerprint, store
+from jaxbundle.adjustment.saved_state import network_fingerprint, own_models, saved_bytes, store
 from jaxbundle.adjustment.second_minima.evidence import SecondMinimum
 from jaxbundle.adjustment.unknowns import (
     angles_near,
@@ -824,6 +824,22 @@ class Adjustment:
         be written."""
         self._require_solved()
         store(self, given_path("path", path))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled, as by `multiprocessing`: what `save` writes, with user-defined camera models."""
+        from jaxbundle.adjustment.load_saved import load_bytes
+
+        models = own_models(self.problem.network)
+        return load_bytes, (saved_bytes(self), tuple(models.values()))
+
+    def __copy__(self) -> "Adjustment":
+        # By `__reduce__` a copy would compute its covariances anew.
+        copied = object.__new__(type(self))
+        vars(copied).update(vars(self))
+        return copied
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Adjustment":
+        return copy.copy(self)
 
     # --- for people -------------------------------------------------------------------------
 

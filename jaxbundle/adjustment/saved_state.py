@@ -6,6 +6,7 @@ these on demand, as in the process that adjusted.
 """
 
 import dataclasses
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -134,10 +135,16 @@ def with_named_models(network: Network) -> Network:
     return network.replace(cameras=tuple(cameras))
 
 
+def own_models(network: Network) -> dict[str, CameraModel]:
+    """The camera models of a network that are not built in, by name."""
+    models = (get_model(camera.model) for camera in network.cameras)
+    return {model.name: model for model in models if is_own(model)}
+
+
 def with_own_models(network: Network, models: Sequence[CameraModel]) -> Network:
     """The network with these camera models for their names."""
-    own_models = {model.name: model for model in models}
-    model = lambda camera: own_models.get(str(camera.model), camera.model)
+    of_name = {model.name: model for model in models}
+    model = lambda camera: of_name.get(str(camera.model), camera.model)
     cameras = (dataclasses.replace(c, model=model(c)) for c in network.cameras)
     return network.replace(cameras=tuple(cameras))
 
@@ -150,8 +157,6 @@ def store(adjustment: Any, path: str | Path) -> None:
 
     problem, minimum = adjustment.problem, adjustment.minimum
     network = problem.network
-    # Own camera models are functions, which a file cannot hold without executing it when read.
-    own_models = {get_model(c.model).name for c in network.cameras if is_own(get_model(c.model))}
     names_of_notes = (
         "removed",
         "eliminated",
@@ -173,7 +178,9 @@ def store(adjustment: Any, path: str | Path) -> None:
         adjustment.sigma0,
         with_named_models(network),
         adjustment.check,
-        tuple(sorted(own_models)),
+        # Models of one's own are functions, which a file cannot hold without executing it when
+        # read: only their names are saved.
+        tuple(sorted(own_models(network))),
         _state(problem, minimum),
         notes | {"doubts": adjustment.given_doubts},
         adjustment.weights,
@@ -182,6 +189,14 @@ def store(adjustment: Any, path: str | Path) -> None:
         adjustment.replication and dataclasses.replace(adjustment.replication, model=None),
     )
     write_tree(path, stored, CLASSES)
+
+
+def saved_bytes(adjustment: Any) -> bytes:
+    """The content of the file that `store` writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "adjustment"
+        adjustment.save(file)
+        return file.read_bytes()
 
 
 def _error_model(adjustment: Any) -> StoredErrorModel | None:
