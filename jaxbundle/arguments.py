@@ -5,11 +5,12 @@ or `jax.grad`) where numbers are needed.
 """
 
 import functools
+import inspect
 import math
 import numbers
 import operator
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -145,6 +146,17 @@ def vector(name: str, value: Any, size: int, expected: str) -> np.ndarray:
     if array.shape not in ((), (size,)) or not np.isfinite(array).all():
         raise InputError(f"{name} must be {expected}, but is {show(array.tolist())}")
     return np.broadcast_to(array, size)
+
+
+def refuse_unknown(name: str, options: Mapping[str, Any], known: Callable[..., Any]) -> None:
+    """Refuse options that a function does not pass on to `known`.
+
+    **Raises:** `TypeError`, as Python does, but naming the function that was called."""
+    names = [*inspect.signature(known).parameters]
+    for option in options.keys() - {*names}:
+        raise TypeError(
+            f"{name}() has no argument {option!r}; beside its own it takes {', '.join(names)}"
+        )
 
 
 def refuse_traced(name: str, *values: Any) -> None:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.adjustment.adjust import adjust, check_options
 from jaxbundle.adjustment.result import Adjustment
-from jaxbundle.arguments import number, positive, show, text, truth, vector
+from jaxbundle.arguments import number, positive, refuse_unknown, show, text, truth, vector
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import CalibrationStart, start_values
@@ -104,6 +104,7 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     text("object_unit", object_unit)
     # Either downweighted or removed: a test of residuals that robust weights changed has no level.
     options |= {"robust": robust, "snooping": None if robust else snooping}
+    refuse_unknown("calibrate", options, check_options)
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
     views = views_of(photographs, board, progress)

@@ -258,6 +258,13 @@ def _check(
             for n in held_values | held_of_first
         ):
             raise InputError(f"calibration {number} has other free parameters, or held values")
+    values = [tuple(camera.parameters[n] for n in names) for camera, _ in calibrations]
+    for number, of_camera in enumerate(values):
+        if of_camera in values[:number]:
+            raise InputError(
+                f"calibrations {values.index(of_camera) + 1} and {number + 1} agree to all digits: "
+                "they are of the same photographs; give calibrations from independent ones"
+            )
     return names
 
 

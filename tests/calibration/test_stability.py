@@ -103,6 +103,8 @@ def test_what_is_not_one_camera_is_refused():
         stability(given[:1])
     with pytest.raises(InputError, match="one for each"):
         stability(given, [1.0, 2.0, 3.0])
+    with pytest.raises(InputError, match="1 and 3 agree to all digits"):
+        stability([*given, given[0]])
     other = dataclasses.replace(given[1][0], image_size=(10, 10))
     with pytest.raises(InputError, match="calibration 2 is of another"):
         stability([given[0], (other, given[1][1])])
@@ -163,7 +165,8 @@ def test_equal_parameters_are_one_unknown():
 
 def test_a_principal_point_alone_leaves_nothing_beside_rotations():
     camera, C = epochs(np.zeros((1, 6)))[0][0], np.diag(SIGMA[2:4] ** 2)
-    found = stability([(camera, (("cx", "cy"), C))] * 2)
+    moved = dataclasses.replace(camera, parameters=camera.parameters | {"cx": 242.1})
+    found = stability([(one, (("cx", "cy"), C)) for one in (camera, moved)])
     assert found.rotation_removed.degrees == 0 and found.rotation_removed.probability == 1
     assert "nothing is left" in str(found)
     assert found.to_dict()["rotation_removed"]["probability"] == 1
