@@ -18,7 +18,7 @@ from jaxbundle.network.unit_mistakes import (
     name_pixels,
     name_sigma_unit,
 )
-from jaxbundle.orientation.angle_units import name_angle_unit
+from jaxbundle.orientation.angle_conventions import name_angle_convention
 from jaxbundle.orientation.image_conventions import name_image_convention, name_image_extent
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL, name_contradiction
@@ -98,7 +98,7 @@ def name_conventions(
     network = problem.network
     causes = (
         name_pixels(network),
-        name_angle_unit(network),
+        name_angle_convention(network),
         *name_lengths(network),
         name_image_convention(network),
         name_image_extent(network),

@@ -8,10 +8,11 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, InputError, grid_of_targets, ring_of_stations, simulate
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.unit_mistakes import LIMITS, name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.orientation.angle_units import name_angle_unit
+from jaxbundle.orientation.angle_conventions import name_angle_convention
 
 PIXEL = {"image_size": (6000, 4000), "pixel_size": (0.006, 0.006)}
 CONTROL = {"control": (0, 4, 20, 24), "control_sigma": 0.002}
@@ -160,9 +161,45 @@ def test_blunders_are_no_unit():
 @pytest.mark.parametrize("right, wrong", [("deg", "gon"), ("gon", "deg"), ("rad", "deg")])
 def test_angles_in_another_unit_are_told(right, wrong):
     given = network()
-    assert name_angle_unit(given.replace(angle_unit=right)) == ""
+    assert name_angle_convention(given.replace(angle_unit=right)) == ""
     angles = given.images.angles * ANGLE_UNITS[wrong] / ANGLE_UNITS[right]
     mistaken = given.replace(
         images=dataclasses.replace(given.images, angles=angles), angle_unit=wrong
     )
-    assert f'set angle_unit = "{right}"' in name_angle_unit(mistaken)
+    assert f'set angle_unit = "{right}"' in name_angle_convention(mistaken)
+
+
+def angles_of_matrices(M):
+    return np.array([omega_phi_kappa_from_matrix(one) for one in M])
+
+
+D = np.diag([1.0, -1, -1])
+CONVENTIONS = {
+    "the rotations lead from the camera to the object": lambda M, X0: (M.transpose(0, 2, 1), X0),
+    "the axes of the cameras have y down and z forward": lambda M, X0: (D @ M, X0),
+    "y down and z forward and the rotations lead from the camera to the object and X0, Y0, Z0 is":
+        lambda M, X0: ((D @ M).transpose(0, 2, 1), -np.einsum("nij,nj->ni", D @ M, X0)),
+    "if X0, Y0, Z0 is the translation": lambda M, X0: (M, -np.einsum("nij,nj->ni", M, X0)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", CONVENTIONS)
+def test_poses_in_another_convention_are_told(words):
+    given = network()
+    M = np.array([matrix_from_omega_phi_kappa(a) for a in given.images.angles])
+    other_M, X0 = CONVENTIONS[words](M, given.images.position)
+    images = dataclasses.replace(given.images, angles=angles_of_matrices(other_M), position=X0)
+    assert words in name_angle_convention(given.replace(images=images))
+
+
+@pytest.mark.parametrize("order, words", [
+    ((1, 0, 2), "phi, omega, kappa"), ((1, 2, 0), "kappa, omega, phi"),
+    ((2, 0, 1), "phi, kappa, omega"),
+])  # fmt: skip
+def test_angles_in_another_order_are_told(order, words):
+    """Columns omega, phi, kappa that hold the angles of `words`."""
+    given = network()
+    names = ["omega", "phi", "kappa"]
+    columns = given.images.angles[:, [names.index(word) for word in words.split(", ")]]
+    images = dataclasses.replace(given.images, angles=columns)
+    assert f"omega, phi, kappa hold {words}:" in name_angle_convention(given.replace(images=images))
