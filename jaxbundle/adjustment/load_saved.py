@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -65,14 +64,6 @@ def load_adjustment(
             "model or kind of your own is not the one that it was saved with"
         )
     return result
-
-
-def load_bytes(content: bytes, models: Sequence[CameraModel]) -> Adjustment:
-    """An `Adjustment` from the content of a saved file."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "adjustment"
-        file.write_bytes(content)
-        return load_adjustment(file, models=models)
 
 
 def _restored(

@@ -40,7 +40,13 @@ from jaxbundle.adjustment.quality.replication import (
 )
 from jaxbundle.adjustment.quality.variance_groups import groups
 from jaxbundle.adjustment.quality.weakness import Weakness, weakness
-from jaxbundle.adjustment.saved_state import network_fingerprint, own_models, saved_bytes, store
+from jaxbundle.adjustment.saved_state import (
+    load_bytes,
+    network_fingerprint,
+    own_models,
+    saved_bytes,
+    store,
+)
 from jaxbundle.adjustment.second_minima.evidence import SecondMinimum
 from jaxbundle.adjustment.unknowns import (
     angles_near,
@@ -827,8 +833,6 @@ class Adjustment:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled, as by `multiprocessing`: what `save` writes, with user-defined camera models."""
-        from jaxbundle.adjustment.load_saved import load_bytes
-
         models = own_models(self.problem.network)
         return load_bytes, (saved_bytes(self), tuple(models.values()))
 

@@ -199,6 +199,16 @@ def saved_bytes(adjustment: Any) -> bytes:
         return file.read_bytes()
 
 
+def load_bytes(content: bytes, models: Sequence[CameraModel]) -> Any:
+    """The `Adjustment` of the content of a saved file."""
+    from jaxbundle import load_adjustment
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "adjustment"
+        file.write_bytes(content)
+        return load_adjustment(file, models=models)
+
+
 def _error_model(adjustment: Any) -> StoredErrorModel | None:
     model = adjustment.error_model
     if model is None:
