@@ -23,8 +23,9 @@ Places = Int[np.ndarray, "m c"]
 class Clusters:
     """m clusters of k rows each: `rows` of the observations, the eliminated row (−1: none of these
     clusters has one), Q, the values of A and of narrow roots F in the columns `A_at` and `F_at`
-    (the number of columns stands for none), and V of a component of many columns. Clusters of
-    equal columns begin at `groups`."""
+    (the number of columns stands for none), and V of a component of many columns. Rows of one
+    cluster are sorted by `segment`, the range of columns of wide roots that they have; clusters of
+    equal columns and segments begin at `groups`."""
 
     rows: Int[np.ndarray, "m k"]
     eliminated: Int[np.ndarray, " m"]
@@ -34,6 +35,7 @@ class Clusters:
     F: Batch
     F_at: Places
     V: Float[np.ndarray, "m k k"] | None
+    segment: Int[np.ndarray, "m k"]
     groups: Int[np.ndarray, " groups"]
 
     def without_fit(self, x: Batch) -> Batch:
@@ -53,8 +55,9 @@ class Clusters:
         """Some of the clusters."""
         fields = self.rows, self.eliminated, self.Q, self.A, self.A_at, self.F, self.F_at
         rows, eliminated, Q, A, A_at, F, F_at = (x[at] for x in fields)
-        V, groups = None if self.V is None else self.V[at], _begin_groups([A_at, F_at])
-        return Clusters(rows, eliminated, Q, A, A_at, F, F_at, V, groups)
+        V, segment = None if self.V is None else self.V[at], self.segment[at]
+        groups = _begin_groups([segment, A_at, F_at])
+        return Clusters(rows, eliminated, Q, A, A_at, F, F_at, V, segment, groups)
 
     def portions(self, columns: int, at_once: int = 1_000_000) -> Iterator["Clusters"]:
         """Some clusters at a time, whose rows of so many columns have at most `at_once` numbers (8
@@ -64,16 +67,31 @@ class Clusters:
         for begin in range(0, m, step):
             yield self.some(slice(begin, begin + step))
 
+    def by_segments(self, columns: int) -> Iterator[tuple["Clusters", list[tuple[int, slice]]]]:
+        """Some clusters at a time (`portions`), whose rows have the same segments; these, with the
+        rows that have them."""
+        for portion in self.portions(columns):
+            begins = _begin_groups([portion.segment])
+            for begin, end in zip(begins, [*begins[1:], len(portion.rows)]):
+                of_row = portion.segment[begin]
+                starts = np.flatnonzero(np.diff(of_row, prepend=-2))
+                ranges = zip(starts, [*starts[1:], len(of_row)])
+                segments = [(int(of_row[a]), slice(a, b)) for a, b in ranges if of_row[a] >= 0]
+                whole = len(begins) == 1
+                yield portion if whole else portion.some(slice(begin, end)), segments
+
     def by_columns(self) -> Iterator[slice]:
         """Clusters of equal columns."""
         for begin, end in zip(self.groups, [*self.groups[1:], len(self.rows)]):
             yield slice(begin, end)
 
 
-def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[Clusters] | None:
+def lay_out_clusters(
+    linear: LinearisedRows, F: Any, segment: Int[np.ndarray, " rows"], many: Any | None
+) -> list[Clusters] | None:
     """The clusters of all rows with a derivative or an error, by their number of rows, from sparse
     roots: of narrow ones, and of the component of many columns; None if a column of this has rows
-    of different clusters."""
+    of different clusters. `segment` of wide roots."""
     cluster = linear.eliminated.copy()
     is_alone = cluster < 0
     # A row without an eliminated row is a cluster of its own: P is 1 there.
@@ -89,7 +107,7 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
             return None
         some |= np.diff(many.indptr) > 0
     order = np.flatnonzero(some)
-    order = order[np.argsort(cluster[order], kind="stable")]
+    order = order[np.lexsort((segment[order], cluster[order]))]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
     roots = [linear.A, F] if many is None else [linear.A, F, many]
     padded, clusters = [_padded(matrix) for matrix in roots], []
@@ -97,6 +115,7 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     # the same photographs, whose sums are one product.
     rng = np.random.default_rng(0)
     of_columns = [rng.integers(1, 1 << 40, absent + 1) for *_, absent in padded[:2]]
+    of_segment = rng.integers(1, 1 << 40, segment.max(initial=-1) + 2)
     key = np.zeros(len(cluster), int)
     for number, (columns, *_) in zip(of_columns, padded):
         key += number[columns].sum(1)
@@ -104,7 +123,8 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
     kinds = np.stack([count, is_alone[order[start]]], 1)
     for kind in np.unique(kinds, axis=0):
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
-        rows = rows[np.argsort(key[rows].sum(1))]
+        # First by segments: clusters with the same ones are products of the same columns.
+        rows = rows[np.lexsort((key[rows].sum(1), of_segment[segment[rows]].sum(1)))]
         (A, A_at), (narrow, narrow_at) = (
             _local(columns[rows], x[rows], absent) for columns, x, absent in padded[:2]
         )
@@ -112,7 +132,9 @@ def lay_out_clusters(linear: LinearisedRows, F: Any, many: Any | None) -> list[C
         for columns, x, absent in padded[2:]:
             V = _products(columns[rows], x[rows], absent)
         fields = rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, narrow, narrow_at
-        clusters.append(Clusters(*fields, V, _begin_groups([A_at, narrow_at])))
+        of_rows = segment[rows]
+        groups = _begin_groups([of_rows, A_at, narrow_at])
+        clusters.append(Clusters(*fields, V, of_rows, groups))
     return clusters
 
 

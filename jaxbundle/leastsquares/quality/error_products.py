@@ -45,15 +45,40 @@ from jaxbundle.types import not_none
 Matrix = Float[np.ndarray, "n m"]
 
 
+class Segments(NamedTuple):
+    """Ranges of columns of a sparse matrix that none of its rows crosses: where they begin, with
+    the number of all columns behind; by row its segment (−1: the row is empty); the matrix with the
+    columns of every row counted from the first of its segment."""
+
+    begin: Int[np.ndarray, " segments+1"]
+    of_row: Int[np.ndarray, " rows"]
+    within: Any
+
+    @property
+    def number(self) -> int:
+        return len(self.begin) - 1
+
+    def rows(self, rows: Int[np.ndarray, "m k"]) -> Batch:
+        """Some rows, in the columns of their segments."""
+        return self.within[rows.ravel()].toarray().reshape(*rows.shape, self.within.shape[1])
+
+    def joined(self, parts: Float[np.ndarray, "segments *n width"]) -> Float[np.ndarray, "*n all"]:
+        """Quantities by the columns of each segment as those of all columns."""
+        width = np.diff(self.begin)
+        return np.concatenate([x[..., :w] for x, w in zip(parts, width)], -1)
+
+
 class RootColumns(NamedTuple):
     """The roots of few columns in two sparse matrices: `narrow` with few values in a row, as of
-    photographs, and `wide`; `mixing`: by the columns of wide ones of every component the matrix
-    that mixes every as many of them as it has rows (None: as they are). `many`: the sparse root of
-    the component of many columns, None if there is none. `of_components`: the columns of every
-    other component, mixed, the narrow ones first."""
+    photographs, and `wide`; `segments`: the columns of wide ones fall into ranges that no row
+    crosses, as those of x and of y of a camera; `mixing`: by the columns of wide ones of every
+    component the matrix that mixes every as many of them as it has rows (None: as they are).
+    `many`: the sparse root of the component of many columns, None if there is none.
+    `of_components`: the columns of every other component, mixed, the narrow ones first."""
 
     narrow: Any
     wide: Any
+    segments: Segments
     mixing: list[tuple[slice, Matrix | None]]
     many: Any | None
     of_components: list[slice | None]
@@ -106,19 +131,19 @@ def sum_products(
     # The place behind the last of each stands for none: clusters have as many places as the largest
     # of their batch needs, and what those left over add is cut away at the end.
     p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.wide.shape[1]
-    d = datum.number
-    with_narrow, with_wide, wide = np.zeros((p + n, p + n)), np.zeros((p + n, w)), gram(roots.wide)
-    AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((p, w)), np.zeros((p, p))
-    AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((d, w))
-    FVF, powers = np.zeros(n), np.zeros(4)
+    d, of_wide = datum.number, roots.segments
+    s, width = of_wide.number, of_wide.within.shape[1]
+    with_narrow, with_wide = np.zeros((p + n, p + n)), np.zeros((s, p + n, width))
+    AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((s, p, width)), np.zeros((p, p))
+    AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((s, d, width))
+    FVF, powers, wide = np.zeros(n), np.zeros(4), gram(roots.wide)
     for of_equal_size in clusters:
-        for c in of_equal_size.portions(of_equal_size.A.shape[2] + of_equal_size.F.shape[2] + w):
+        number = of_equal_size.A.shape[2] + of_equal_size.F.shape[2] + w
+        for c, segments in of_equal_size.by_segments(number):
             a = c.A.shape[2]
             columns = np.concatenate([c.A_at, p + c.F_at], 1)
-            W = roots.wide_rows(c.rows)
-            # WᵀPW = WᵀW − (QᵀW)ᵀ·QᵀW: three rows of QᵀW for a point instead of all of its rays.
-            QW = _tall(c.Q.transpose(0, 2, 1) @ W)
-            wide -= QW.T @ QW
+            W = of_wide.rows(c.rows)
+            _subtract_fit(wide, c, W, segments, of_wide)
             X = c.without_fit(np.concatenate([c.A, c.F], 2))
             A, F = X[:, :, :a], X[:, :, a:]
             h = datum.effects(c.Q, c.eliminated)
@@ -135,32 +160,78 @@ def sum_products(
             # Clusters of the same photographs add to the same places: one product for all of them.
             for some in c.by_columns():
                 rows, x, y = columns[some.start], _tall(X[some]), _tall(joint[some])
-                rows_of_A, product_with_wide = rows[:a], y.T @ _tall(W[some])
+                rows_of_A = rows[:a]
                 with_narrow[rows[:, None], rows] += x.T @ x
-                with_wide[rows] += product_with_wide[: len(rows)]
-                hW += product_with_wide[len(rows) : len(rows) + d]
+                for segment, of_segment in segments:
+                    product = _tall(joint[some, of_segment]).T @ _tall(W[some, of_segment])
+                    with_wide[segment, rows] += product[: len(rows)]
+                    hW[segment] += product[len(rows) : len(rows) + d]
+                    if c.V is not None:
+                        AV_wide[segment, rows_of_A] += product[len(rows) + d :]
                 hF[:, rows[a:] - p] += _tall(h[some]).T @ _tall(c.F[some])
                 if c.V is not None:
                     v, b = _tall(VA[some]), y[:, len(rows) + d :]
                     AV[rows_of_A[:, None], rows] += v.T @ x
-                    AV_wide[rows_of_A] += product_with_wide[len(rows) + d :]
                     AVPVA[rows_of_A[:, None], rows_of_A] += b.T @ b
                     AVh[rows_of_A] += x[:, :a].T @ _tall(Vh[some])
     kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
-    mixed = roots.mix(with_wide)
+    mixed = roots.mix(of_wide.joined(with_wide))
     wide = roots.mix(roots.mix(wide).T)
     return ClusterSums(
         np.concatenate([with_narrow[kept, narrow], mixed[kept]], 1),
         np.block([[with_narrow[narrow, narrow], mixed[narrow]], [mixed[narrow].T, wide]]),
-        np.concatenate([hF[:, : n - 1], roots.mix(hW)], 1),
+        np.concatenate([hF[:, : n - 1], roots.mix(of_wide.joined(hW))], 1),
         AV[kept, kept],
-        np.concatenate([AV[kept, narrow], roots.mix(AV_wide[kept])], 1),
+        np.concatenate([AV[kept, narrow], roots.mix(of_wide.joined(AV_wide)[kept])], 1),
         AVPVA[kept, kept],
         AVh[kept],
         hVh,
         FVF[: n - 1],
         powers,
     )
+
+
+def _subtract_fit(
+    wide: Matrix,
+    c: Clusters,
+    W: Batch,
+    segments: Sequence[tuple[int, slice]],
+    of_wide: Segments,
+) -> None:
+    """WᵀPW = WᵀW − (QᵀW)ᵀ·QᵀW: three rows of QᵀW for a point instead of all of its rays."""
+    parts = []
+    for segment, rows in segments:
+        columns = slice(of_wide.begin[segment], of_wide.begin[segment + 1])
+        part = W[:, rows, : columns.stop - columns.start]
+        parts.append((columns, _tall(c.Q[:, rows].transpose(0, 2, 1) @ part)))
+    for k, (columns, x) in enumerate(parts):
+        wide[columns, columns] -= x.T @ x
+        for others, y in parts[:k]:
+            product = x.T @ y
+            wide[columns, others] -= product
+            wide[others, columns] -= product.T
+
+
+def segments_of(F: Any) -> Segments:
+    """The segments of a sparse matrix."""
+    import scipy.sparse as sp
+
+    count = np.diff(F.indptr)
+    of_row, some = np.full(F.shape[0], -1), np.flatnonzero(count)
+    begin, first = np.zeros(1, int), np.zeros(0, int)
+    if len(some):
+        first = np.minimum.reduceat(F.indices, F.indptr[some])
+        last = np.maximum.reduceat(F.indices, F.indptr[some])
+        # Rows that reach from before a column to it or beyond; columns of no row join others.
+        crossing = np.bincount(first + 1, minlength=F.shape[1] + 2).cumsum()
+        crossing -= np.bincount(last + 1, minlength=F.shape[1] + 2).cumsum()
+        begin = np.flatnonzero(crossing[: F.shape[1]] == 0)
+        of_row[some] = np.searchsorted(begin, first, side="right") - 1
+    begin = np.append(begin, F.shape[1])
+    width = int(np.diff(begin).max(initial=0))
+    indices = F.indices - np.repeat(begin[of_row], count).astype(F.indices.dtype)
+    within = sp.csr_matrix((F.data, indices, F.indptr), (F.shape[0], width))
+    return Segments(begin, of_row, within)
 
 
 def gram(F: Any) -> Matrix:
@@ -487,7 +558,8 @@ def error_products(
     if sorted_roots is None or not isinstance(reduced, DenseFactor):
         return None
     linear = linearise_rows(solution)
-    clusters = lay_out_clusters(linear, sorted_roots.narrow, sorted_roots.many)
+    segment = sorted_roots.segments.of_row
+    clusters = lay_out_clusters(linear, sorted_roots.narrow, segment, sorted_roots.many)
     if clusters is None:
         return None
     return ErrorProducts(solution, linear, clusters, sorted_roots, reduced)
@@ -529,7 +601,10 @@ def _sort_roots(
         root, mixing = roots[k]
         of_many = root if mixing is None else root @ _repeat(mixing, root.shape[1])
     joined = lambda x: sp.hstack(x).tocsr() if len(x) > 2 else x[-1]
-    return RootColumns(joined(narrow), joined(wide), mixed, of_many, of_components)
+    all_wide = joined(wide)
+    return RootColumns(
+        joined(narrow), all_wide, segments_of(all_wide), mixed, of_many, of_components
+    )
 
 
 def _repeat(mixing: Matrix, columns: int) -> Any:
