@@ -47,6 +47,6 @@ Robust = Annotated[str | None, choice(ESTIMATORS, "instead of removal")]
 CrossValidation = Annotated[
     bool, typer.Option(help="calibrate from each half of the photographs: 4 adjustments")
 ]
-Unit = Annotated[str, typer.Option(help="unit of the board, a label")]
+Unit = Annotated[str, typer.Option(help="unit of the board: m, mm, in, …")]
 Brief = Annotated[bool, typer.Option("--brief", help="omit points and residuals from the JSON")]
 Plots = Annotated[bool, typer.Option(help="write plots to --out")]
