@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle.adjustment.far_points import (
     FAR_POINTS,
     angle_of_rays,
-    noise_of_rays,
 )
 from jaxbundle.adjustment.minimum import adjusted_cameras, are_finite
 from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coordinates
@@ -26,6 +25,7 @@ from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.equation_counts import equations_of
+from jaxbundle.network.noise import noise_of_rays
 from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.orientation import batched

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
 from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coordinates
-from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.any_distance import LARGEST_DISTANCE, is_at_infinity
 from jaxbundle.leastsquares.indexing.rows import Values
@@ -25,7 +24,7 @@ from jaxbundle.leastsquares.iterations.stopping import LIMIT
 from jaxbundle.leastsquares.problem import with_data, with_factor, with_free
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.spaces import PoseValue
-from jaxbundle.network.tables import Network
+from jaxbundle.network.noise import noise_of_rays
 from jaxbundle.orientation.batched import matrices_of_quaternions
 from jaxbundle.orientation.rays import make_sights
 from jaxbundle.types import not_none
@@ -153,21 +152,6 @@ def minimise_holding_infinite_points(
         if changed:
             is_held = to_hold
             problem = _hold_at_infinity(problem, is_held, start)
-
-
-def noise_of_rays(network: Network) -> float:
-    """The median a priori σ of an image coordinate, in principal distances."""
-    c = np.array(
-        [
-            min(
-                (camera.parameters[n] for n in get_model(camera.model).principal_distance),
-                default=1.0,
-            )
-            for camera in network.cameras
-        ]
-    )
-    camera = network.images.camera[network.observations.image]
-    return float(np.median(network.observations.sigma.max(1) / np.abs(c[camera])))
 
 
 def angle_of_rays(problem: NetworkProblem, values: Values) -> Float[np.ndarray, " points"]:

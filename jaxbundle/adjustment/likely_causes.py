@@ -4,14 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from jaxbundle.adjustment.far_points import (
-    noise_of_rays,
-)
 from jaxbundle.adjustment.minimum import name_inseparable, name_undefined
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import contradicts
 from jaxbundle.leastsquares.iterations.solver import Minimum
+from jaxbundle.network.noise import noise_of_rays
 from jaxbundle.network.tables import UNIT, Network
 from jaxbundle.network.unit_mistakes import (
     name_lengths,

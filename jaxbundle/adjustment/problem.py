@@ -25,7 +25,7 @@ from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import DeclaredNetwork, declare, order_cameras
 from jaxbundle.network.kinds.base import included_tables
 from jaxbundle.network.kinds.image_points import image_coordinates
-from jaxbundle.network.retraction import TurnAboutSeen
+from jaxbundle.network.retraction import TurnAboutSeen, control_is_weak
 from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.types import AnyArray, not_none
@@ -294,6 +294,11 @@ def make_problem(
             f"{error.defect} of 7 parameters are open: give at least three free points that "
             "are not collinear (datum_points), or omit the setting"
         ) from None
+    if problem.plan.datum is None and control_is_weak(
+        network, engine.information_of_motions(problem), problem.counts.observations
+    ):
+        retraction = TurnAboutSeen(problem.declared, moves_as_one=True)
+        problem = dataclasses.replace(problem, retraction=retraction)
     return _of_network(problem, network, declared)
 
 

@@ -37,7 +37,7 @@ from jaxbundle.leastsquares.iterations.stopping import Tolerance
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.leastsquares.whitening import diagonal, has_weight, inverse_sigma
 from jaxbundle.system.memory import return_freed_memory
-from jaxbundle.types import AnyArray, Scalar
+from jaxbundle.types import AnyArray, Scalar, not_none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,6 +223,20 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     plan = dataclasses.replace(problem.plan, datum=jax.device_put(datum))
     counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
     return dataclasses.replace(problem, plan=plan, counts=counts)
+
+
+def information_of_motions(problem: Problem) -> Float[np.ndarray, "motions motions"]:
+    """GᵀJᵀPJG of the declared motions G, of all observations that a motion changes, at the start
+    values; `nan` where unknowns are held that a motion would move."""
+    motions = not_none(problem.declared.motions)
+    moved, number = [name for name, _ in motions.actions], len(motions.names)
+    if any((t.free == 0).any() for t in problem.tables if t.name in moved):
+        return np.full((number, number), np.nan)
+    data = pad_data(problem, problem.data)
+    real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
+    survey = survey_motions(problem.declared, problem.plan, data, real)
+    products = np.concatenate([np.zeros((0, number)), *map(np.asarray, survey.products)])
+    return products.T @ products
 
 
 def with_motions_at(problem: AnyProblem, values: Values) -> AnyProblem:

@@ -1,19 +1,26 @@
-"""The retraction of a network: images rotate about the points they see."""
+"""The retraction of a network: images rotate about the points they see, and a network that its
+control hardly holds rotates as one."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.equations.normal import sum_over_devices
+from jaxbundle.leastsquares.datum.conditions import free_of_tables
+from jaxbundle.leastsquares.datum.motions import ROTATION
+from jaxbundle.leastsquares.equations.normal import Rows, sum_over_devices
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
 from jaxbundle.leastsquares.indexing.rows import Declared, Values
-from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract
+from jaxbundle.leastsquares.iterations.retraction import changes_of_tables, retract_tables
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.kinds.image_points import ImagePoint
-from jaxbundle.types import AnyArray
+from jaxbundle.network.noise import noise_of_rays
+from jaxbundle.network.tables import Network
+from jaxbundle.types import AnyArray, not_none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,15 +33,26 @@ class TurnAboutSeen:
     12 steps to the minimum instead of 21.) The centre is weighted by 1/distance², the information
     of a point about the position, so that far points do not dominate it. Images with held position
     rotate about it.
+
+    `moves_as_one`: what a step has in common with a similarity of the whole network is a finite
+    similarity, which changes no ray, where points would move along tangents (`control_is_weak`).
     """
 
     declared: Declared
+    moves_as_one: bool = False
 
     def __call__(self, plan: Plan, values: Values, change: Tangent) -> Values:
-        retracted = retract(self.declared, plan, values, change)
         changes = changes_of_tables(plan, values, change)
         if "image" not in changes:
-            return retracted
+            return retract_tables(self.declared, values, changes)
+        if not self.moves_as_one:
+            return self._turn(plan, values, changes)
+        motion = _motion_of_images(plan, values["image"], changes["image"])
+        remaining = _without_motion(self.declared, motion, values, changes)
+        return _move(self.declared, plan, motion, self._turn(plan, values, remaining))
+
+    def _turn(self, plan: Plan, values: Values, changes: dict[str, Rows]) -> Values:
+        retracted = retract_tables(self.declared, values, changes)
         old, new, pivot = values["image"], retracted["image"], self._middle(plan, values)
 
         def position(
@@ -76,3 +94,67 @@ class TurnAboutSeen:
             sums = sums + jax.ops.segment_sum(rows, image.ravel(), position.shape[0])
         sums = sum_over_devices(plan, sums)
         return sums[:, :3] / jnp.where(sums[:, 3:] > 0, sums[:, 3:], 1.0)
+
+
+def _motion_of_images(plan: Plan, images: PoseValue, changes: Rows) -> Float[Array, "7"]:
+    """The similarity nearest to a change of images: the mean of their rotations in object space,
+    then the shift and the scale that fit what their positions move beside."""
+    free = plan.groups["image"].free.all(1, keepdims=True)
+    mean = lambda x: jnp.sum(jnp.where(free, x, 0.0), 0) / jnp.maximum(free.sum(), 1)
+    # A turn r of the object is −M·r in the frame of the camera (`geometry.helmert_pose`).
+    M = jax.vmap(matrix_from_quaternion)(images.rotation)
+    turn = -mean(jnp.einsum("nji,nj->ni", M, changes[:, 3:]))
+    moved = changes[:, :3] - jnp.cross(turn, images.position)
+    X = images.position - mean(images.position)
+    square = mean(jnp.sum(X * X, 1, keepdims=True))
+    scale = mean(jnp.sum(X * moved, 1, keepdims=True)) / jnp.where(square > 0, square, 1.0)
+    shift = mean(moved) - scale * mean(images.position)
+    return jnp.concatenate([shift, turn, scale])
+
+
+def _without_motion(
+    declared: Declared, motion: Float[Array, "7"], values: Values, changes: dict[str, Rows]
+) -> dict[str, Rows]:
+    """The changes of tables beside those by a motion, to first order."""
+    remaining = dict(changes)
+    for name, act in not_none(declared.motions).actions:
+        if name in changes:
+            space, near = declared.spaces[name], getattr(act, "near", act)
+            difference = getattr(space, "small_difference", space.difference)
+            change = lambda m, value, near=near, difference=difference: difference(
+                near(m, value), value
+            )
+            along = lambda value, change=change: jax.jvp(
+                lambda m: change(m, value), (jnp.zeros(7),), (motion,)
+            )[1]
+            remaining[name] = changes[name] - jax.vmap(along)(values[name])
+    return remaining
+
+
+def _move(declared: Declared, plan: Plan, motion: Float[Array, "7"], values: Values) -> Values:
+    """The tables after a motion; held unknowns stay."""
+    moved, free = dict(values), free_of_tables(declared, plan, values)
+    for name, act in not_none(declared.motions).actions:
+        space, move = declared.spaces[name], getattr(act, "move", act)
+        row = lambda value, f, space=space, move=move: space.hold(move(motion, value), value, f)
+        moved[name] = jax.vmap(row)(values[name], free[name])
+    return moved
+
+
+def control_is_weak(
+    network: Network, information: Float[np.ndarray, "7 7"], observations: int
+) -> bool:
+    """Whether control holds the rotation of a network so loosely that straight steps cannot follow
+    it.
+
+    `information`: of the similarity parameters, by all observations that a similarity changes. A
+    step by one σ of a rotation, α, lowers vᵀPv by 1; moved along tangents, points miss where they
+    should be by α²/2 of their distance, and n rays with noise of ε radians raise it by
+    n·(α²/(2·ε))². Steps are cut where the second is larger: α² > 2·ε/√n.
+    """
+    scale = np.sqrt(np.diagonal(information))
+    if not (scale > 0).all():
+        return False
+    cofactor = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    variance = np.linalg.eigvalsh(cofactor[ROTATION, ROTATION]).max()
+    return bool(variance > 2 * noise_of_rays(network) / math.sqrt(observations))

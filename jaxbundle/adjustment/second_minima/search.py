@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.adjustment.far_points import concatenate_runs, noise_of_rays
+from jaxbundle.adjustment.far_points import concatenate_runs
 from jaxbundle.adjustment.minimum import adjusted_cameras, inspect_solution
 from jaxbundle.adjustment.problem import NetworkProblem, with_coordinates
 from jaxbundle.adjustment.quality.inspection import Inspection
@@ -52,6 +52,7 @@ from jaxbundle.leastsquares.iterations.stopping import LIMIT
 from jaxbundle.leastsquares.quality.distributions import chi2_quantile
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.noise import noise_of_rays
 from jaxbundle.network.tables import UNIT
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import START_VALUE_LIMITS, Model, grow, intersect

@@ -11,8 +11,13 @@ from jaxbundle.leastsquares.spaces import Frame
 
 def retract(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Values:
     """The tables after a change; held unknowns must have a zero change."""
+    return retract_tables(declared, values, changes_of_tables(plan, values, change))
+
+
+def retract_tables(declared: Declared, values: Values, changes: dict[str, Rows]) -> Values:
+    """The tables after a change of each, [rows, width]."""
     tables = dict(values)
-    for name, rows in changes_of_tables(plan, values, change).items():
+    for name, rows in changes.items():
         tables[name] = jax.vmap(declared.spaces[name].retract)(values[name], rows)
     return tables
 
