@@ -64,6 +64,7 @@ def compose_certificate(certificate: "Certificate") -> Iterator[str]:
     title = certificate.title + (f" {details['number']}" if "number" in details else "")
     sections = [
         _result_section(certificate),
+        *_findings(certificate),
         *_results(certificate),
         *_rig(certificate),
         *_acceptance(certificate),
@@ -83,6 +84,20 @@ def compose_certificate(certificate: "Certificate") -> Iterator[str]:
 def _result_section(certificate: "Certificate") -> Section:
     parts = [_cards(find_cards(certificate)), *map(_picture, certificate.parts[:1])]
     return Section("certificate", "Result", "".join([*parts, _identity(certificate)]))
+
+
+def _findings(certificate: "Certificate") -> Iterator[Section]:
+    """What lowers the verdict of the tests, in full."""
+    lowering = [one for one in verdict_of(certificate.result).findings if one.lowers]
+    rows = "".join(
+        f'<tr><th scope="row">{text(clean(one.about))}</th><td>{text(one.state)}: '
+        f"{text(clean(one.words))}</td></tr>\n"
+        for one in lowering
+    )
+    if rows:
+        yield Section(
+            "findings", "Findings", f'<table class="facts">\n{rows}</table>\n', "Findings"
+        )
 
 
 def _cards(cards: Sequence[Card]) -> str:

@@ -7,7 +7,17 @@ from typing import Annotated
 import typer
 
 from jaxbundle.choices import ANGLE_UNIT_NAMES, CODED_TARGETS, MATCHED_PAIRS, TIE_POINTS
-from jaxbundle.cli.app import Check, Correlated, Force, Html, Json, Quiet, app, choice
+from jaxbundle.cli.app import (
+    NOT_SOLVED,
+    Check,
+    Correlated,
+    Force,
+    Html,
+    Json,
+    Quiet,
+    app,
+    choice,
+)
 from jaxbundle.cli.certificate_options import (
     Accept,
     CertificateFile,
@@ -161,6 +171,9 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     if surface:
         _surface(out, photos[0], force, quiet)
     judge.end(judgement)
+    if any(part.no_control for part in result.parts):
+        # The network is solved, but not where control was to put it: a script has to see that.
+        raise typer.Exit(NOT_SOLVED)
 
 
 def _surface(out: Path, photos: Path, force: bool, quiet: bool) -> None:

@@ -99,9 +99,21 @@ def to_map(
     except pyproj.exceptions.ProjError:
         raise InputError(f"{where}: coordinate system {system!r} is not known") from None
     if not crs.is_geographic:
-        code = crs.to_epsg()
+        code, axis = crs.to_epsg(), crs.axis_info[0]
+        if axis.unit_conversion_factor != 1:
+            raise InputError(
+                f"{where}: {system} is in {axis.unit_name} ({axis.unit_conversion_factor:.9g} m); "
+                "σ and distances are metres here: give the coordinates in a system in metres, such "
+                "as the UTM zone"
+            )
         return X, f"EPSG:{code}" if code else crs.to_string()
     target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
+    outside = (abs(X[:, 1]) > 90) | (abs(X[:, 0]) > 360)
+    for longitude, latitude, _ in X[outside]:
+        raise InputError(
+            f"{where}: {longitude:g}, {latitude:g} is no place in {system}: expected longitude, "
+            "then latitude, in degrees"
+        )
     x, y = _transformer(crs, target, where).transform(X[:, 0], X[:, 1])
     return np.stack([x, y, X[:, 2]], 1), target
 

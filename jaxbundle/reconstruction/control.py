@@ -79,15 +79,24 @@ def read_control_measurements(path: str | Path) -> Control:
     if not rows:
         raise InputError(f"{path}: the file is empty")
     # Three formats, told apart by the first line: column names, a coordinate system, anything else.
-    head = [cell.strip().lower() for cell in rows[0][1].split(",")]
-    if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
-        return _read_table(path, head, rows[1:])
+    for separator in SEPARATORS:
+        head = [cell.strip().lower() for cell in rows[0][1].split(separator)]
+        if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
+            return _read_table(path, head, rows[1:], separator)
     first_line = rows[0][1].strip()
     if first_line.upper().startswith(("EPSG:", "WGS84", "+PROJ", "PROJCS", "GEOGCS")):
         return _read_gcp_list(path, first_line, rows[1:])
+    if _is_sighting(_cells(rows[0][1])):
+        raise InputError(
+            f"{path}, line {rows[0][0]}: the first line of a list X Y Z u v photograph [name] "
+            "names its coordinate system, such as EPSG:32611"
+        )
     points = read_control(path)
     return Control(points, (), np.zeros((0, 2)), np.zeros(0))
 
+
+# Between the cells of a table.
+SEPARATORS = (",", ";", "\t")
 
 # Point, its coordinates, photograph, pixels, their σ, and the line of the file.
 Record = tuple[str, tuple[float, float, float], str, tuple[float, float], float, int]
@@ -96,25 +105,46 @@ Record = tuple[str, tuple[float, float, float], str, tuple[float, float], float,
 def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> Control:
     records = []
     for number, line in rows:
-        cells = line.split()
-        try:
-            X, Y, Z, u, v = (float(cell) for cell in cells[:5])
-            image = cells[5]
-        except (ValueError, IndexError):
+        cells = _cells(line)
+        if not _is_sighting(cells):
             raise InputError(
-                f"{path}, line {number}: expected X Y Z u v photograph [name], got {line!r}"
-            ) from None
+                f"{path}, line {number}: expected X Y Z u v photograph [name], separated by blanks "
+                f"or tabs, with decimal points, got {line!r}"
+            )
+        X, Y, Z, u, v = (float(cell) for cell in cells[:5])
+        image = cells[5]
+        if "." not in image:
+            raise InputError(
+                f"{path}, line {number}: {image!r} is no file name; a name with blanks needs tabs "
+                "between the columns"
+            )
         # Without a name rows of one point are known by their equal coordinates, as text.
         name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
         records.append((name, (X, Y, Z), image, (u, v), MANUAL_SIGMA, number))
     return _collect(path, records, system, {})
 
 
-def _read_table(path: Path, head: Sequence[str], rows: Sequence[tuple[int, str]]) -> Control:
+def _cells(line: str) -> list[str]:
+    """The cells of a list, by tabs if there are enough, else by blanks."""
+    by_tabs = [cell.strip() for cell in line.split("\t")]
+    return by_tabs if len(by_tabs) >= 6 else line.split()
+
+
+def _is_sighting(cells: Sequence[str]) -> bool:
+    """Whether cells are five numbers and a photograph."""
+    try:
+        return len([float(cell) for cell in cells[:5]]) == 5 and len(cells) > 5
+    except ValueError:
+        return False
+
+
+def _read_table(
+    path: Path, head: Sequence[str], rows: Sequence[tuple[int, str]], separator: str
+) -> Control:
     records, sigmas = [], {}
     for number, line in rows:
         with foreign_parser(f"{path}, line {number}", "a row of a CSV table"):
-            (row,) = csv.reader([line], skipinitialspace=True)
+            (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
         if len(row) != len(head):
             raise InputError(
                 f"{path}, line {number}: {len(row)} cells where the header has {len(head)} "
@@ -129,6 +159,8 @@ def _read_table(path: Path, head: Sequence[str], rows: Sequence[tuple[int, str]]
             number: int = number,
         ) -> float:
             text = (cells.get(name) or "").strip()
+            # Where commas do not separate, they are decimal ones.
+            text = text if separator == "," else text.replace(",", ".")
             try:
                 return float(text) if text else otherwise
             except ValueError:
@@ -138,7 +170,14 @@ def _read_table(path: Path, head: Sequence[str], rows: Sequence[tuple[int, str]]
 
         id, role = cells["id"].strip(), (cells.get("role") or "control").strip()
         check_choice("role", role, ROLES, f"{path}, line {number}: ")
-        sigmas[id] = ([value(f"s{axis}") for axis in "xyz"], role)
+        stated = [value(f"s{axis}") for axis in "xyz"]
+        if any(s <= 0 for s in stated):
+            raise InputError(f"{path}, line {number}: sX, sY, sZ must be positive, or empty")
+        above, role_above = sigmas.get(id, (stated, role))
+        if role != role_above or any(a != s for a, s in zip(above, stated) if a > 0 and s > 0):
+            raise InputError(f"{path}, line {number}: point {id} has another σ or role above")
+        # One row of a point may state its σ for all.
+        sigmas[id] = [s if s > 0 else a for a, s in zip(above, stated)], role
         X, uv = tuple(value(axis) for axis in "xyz"), (value("u"), value("v"))
         image, sigma = cells["image"].strip(), value("suv", MANUAL_SIGMA)
         records.append((id, X, image, uv, sigma, number))

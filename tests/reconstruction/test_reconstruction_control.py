@@ -63,6 +63,14 @@ def test_tables_with_and_without_measurements(tmp_path):
     np.testing.assert_allclose(found.sigma, [0.5, 1.0])
     plain = read_control_measurements(written(tmp_path, "id,X,Y,Z\n45,1,2,3\n"))
     assert plain.points.id == ("45",) and plain.sightings == ()
+    # σ stated once, decimal commas, tabs in a list whose names have blanks
+    other = read_control_measurements(written(tmp_path, (
+        "id;X;Y;Z;sX;sY;sZ;image;u;v\nP;1,5;2;3;0,1;0,1;0,2;a.jpg;10;20\nP;1,5;2;3;;;;b.jpg;11;21\n"
+    )))  # fmt: skip
+    np.testing.assert_allclose(other.points.position, [[1.5, 2, 3]])
+    np.testing.assert_allclose(other.points.sigma, [[0.1, 0.1, 0.2]])
+    listed = written(tmp_path, "EPSG:32633\n1\t2\t3\t4\t5\tFlug Süd.jpg\tGCP 02\n")
+    assert read_control_measurements(listed).sightings == (("Flug Süd.jpg", "GCP 02"),)
 
 
 @pytest.mark.parametrize("text, said", [
@@ -70,7 +78,13 @@ def test_tables_with_and_without_measurements(tmp_path):
     ("EPSG:4326\n15 48 200 1 a.jpg\n", "line 2: expected X Y Z u v photograph"),
     ("EPSG:32633\n1 2 3 4 5 a.jpg P\n1 2 9 4 5 b.jpg P\n", "line 3: point P has other"),
     ("EPSG:32633\n", "no control points"),
+    ("EPSG:2229\n1 2 3 4 5 a.jpg P\n", r"is in US survey foot \(0.30480061 m\)"),
+    ("EPSG:4326\n34.4 -119.9 0 4 5 a.jpg P\n", "34.4, -119.9 is no place in EPSG:4326"),
+    ("1 2 3 4 5 a.jpg P\n", "line 1: the first line of a list .* names its coordinate system"),
+    ("EPSG:32633\n1 2 3 4 5 Flug Süd.jpg P\n", "line 2: 'Flug' is no file name"),
     ("id,X,Y,Z,image,u,v\nP,1,2,x,a.jpg,1,2\n", "line 2: z is 'x'"),
+    ("id,X,Y,Z,sX,image,u,v\nP,1,2,3,-1,a.jpg,1,2\n", "line 2: sX, sY, sZ must be positive"),
+    ("id,X,Y,Z,sX,image,u,v\nP,1,2,3,1,a.jpg,1,2\nP,1,2,3,2,b.jpg,1,2\n", "P has another σ"),
 ])  # fmt: skip
 def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
     with pytest.raises(InputError, match=said):
