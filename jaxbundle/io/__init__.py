@@ -40,7 +40,7 @@ _HOME = {
     "jaxbundle.io.scanner.flight": ("FlightFile", "read_flight"),
     "jaxbundle.io.scanner.read": ("read_scanner",),
     "jaxbundle.io.scanner.refinement": ("RefineFile", "read_refinement"),
-    "jaxbundle.io.scanner.rpc": ("read_rpc", "write_rpc"),
+    "jaxbundle.io.scanner.rpc": ("StatedErrors", "read_rpc", "read_stated_errors", "write_rpc"),
     "jaxbundle.io.results.result_project": ("adjusted_network", "readjustable_network"),
 }
 __getattr__, __dir__, __all__ = import_on_use(globals(), _HOME)

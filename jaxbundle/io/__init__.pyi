@@ -65,7 +65,9 @@ from jaxbundle.io.scanner.flight import read_flight as read_flight
 from jaxbundle.io.scanner.read import read_scanner as read_scanner
 from jaxbundle.io.scanner.refinement import RefineFile as RefineFile
 from jaxbundle.io.scanner.refinement import read_refinement as read_refinement
+from jaxbundle.io.scanner.rpc import StatedErrors as StatedErrors
 from jaxbundle.io.scanner.rpc import read_rpc as read_rpc
+from jaxbundle.io.scanner.rpc import read_stated_errors as read_stated_errors
 from jaxbundle.io.scanner.rpc import write_rpc as write_rpc
 
 __all__ = [
@@ -79,6 +81,7 @@ __all__ = [
     "OutputFormat",
     "RefineFile",
     "StateFit",
+    "StatedErrors",
     "TARGETS",
     "adjusted_network",
     "convert",
@@ -96,6 +99,7 @@ __all__ = [
     "read_refinement",
     "read_rpc",
     "read_scanner",
+    "read_stated_errors",
     "read_target",
     "readjustable_network",
     "to_pycolmap",

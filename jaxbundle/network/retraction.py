@@ -142,7 +142,10 @@ def _move(declared: Declared, plan: Plan, motion: Float[Array, "7"], values: Val
 
 
 def control_is_weak(
-    network: Network, information: Float[np.ndarray, "7 7"], observations: int
+    network: Network,
+    information: Float[np.ndarray, "7 7"],
+    observations: int,
+    straight_steps: float = 10.0,
 ) -> bool:
     """Whether control holds the rotation of a network so loosely that straight steps cannot follow
     it.
@@ -150,11 +153,13 @@ def control_is_weak(
     `information`: of the similarity parameters, by all observations that a similarity changes. A
     step by one σ of a rotation, α, lowers vᵀPv by 1; moved along tangents, points miss where they
     should be by α²/2 of their distance, and n rays with noise of ε radians raise it by
-    n·(α²/(2·ε))². Steps are cut where the second is larger: α² > 2·ε/√n.
+    n·(α²/(2·ε))². Steps are cut where the second is larger, at α² = 2·ε/√n; `straight_steps` of
+    that length for one σ are what an adjustment takes anyway, and more are crept.
     """
     scale = np.sqrt(np.diagonal(information))
     if not (scale > 0).all():
         return False
     cofactor = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     variance = np.linalg.eigvalsh(cofactor[ROTATION, ROTATION]).max()
-    return bool(variance > 2 * noise_of_rays(network) / math.sqrt(observations))
+    longest_square = 2 * noise_of_rays(network) / math.sqrt(observations)
+    return bool(variance > straight_steps**2 * longest_square)

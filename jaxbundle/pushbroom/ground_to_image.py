@@ -119,6 +119,8 @@ def project_points(
     """
     if jnp.ndim(X) != 2 or jnp.shape(X)[0] != 3:  # noqa: PLR2004 - coordinates
         raise InputError(f"X: expected the shape [3, n], coordinates first, got {jnp.shape(X)}")
+    # Whole numbers and single precision are coordinates too.
+    X = jnp.asarray(X, float)
     return _project_points(scanner_of(image), search, X, most, margin)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.arguments import without_masks
+from jaxbundle.errors import InputError
 from jaxbundle.geometry.vectors import Triple, difference, length, point_on_ray, rotate
 from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refract
 from jaxbundle.pushbroom.corrections import true_direction as without_aberration
@@ -82,5 +83,13 @@ def locate_points(
     pixels: Float[AnyArray, " n"],
 ) -> Float[Array, "3 n"]:
     """The points of scattered image positions, with one pose each; positions outside the image are
-    extrapolated."""
+    extrapolated. The surface is one of the frame of the image: `Plane` in a local one, `Height` of
+    its ellipsoid on a planet.
+
+    **Raises:** `InputError` for lines and pixels that are not arrays [n]."""
+    lines, pixels = jnp.asarray(lines, float), jnp.asarray(pixels, float)
+    if lines.ndim != 1 or lines.shape != pixels.shape:
+        raise InputError(
+            f"lines and pixels: expected two arrays [n], got {lines.shape} and {pixels.shape}"
+        )
     return jnp.stack(jax.vmap(lambda l, u: locate_point(image, surface, l, u))(lines, pixels))

@@ -7,7 +7,7 @@ import rasterio
 from rpc_scenes import made_up
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
+from jaxbundle.io.scanner.rpc import StatedErrors, read_rpc, read_stated_errors, write_rpc
 
 RPC = made_up(longitude_offset=12.3)
 
@@ -37,6 +37,26 @@ def test_round_trips(tmp_path, name):
     else:
         assert_same(read_rpc(path))
     assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("errors", [StatedErrors(3.29, 0.26), StatedErrors()])
+@pytest.mark.parametrize("name", ["image_RPC.TXT", "image.RPB", "image.tif"])
+def test_stated_errors_are_kept_and_none_is_not_zero(tmp_path, name, errors):
+    path = tmp_path / name
+    write_raster(tmp_path / "image.tif")
+    write_rpc(path, RPC, errors)
+    assert read_stated_errors(path) == errors
+    if path.suffix != ".tif":
+        assert ("err" in path.read_text().lower()) == bool(errors.bias)
+    with rasterio.open(tmp_path / "image.tif") as source:
+        tags = source.rpcs
+    unknown = [(-1.0, -1.0), (None, None)]
+    assert (tags.err_bias, tags.err_rand) in ([(*errors,)] if errors.bias else unknown)
+
+
+def test_an_unknown_ending_of_coefficients_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"x.rbp: coefficients end in .txt, .rpb"):
+        write_rpc(tmp_path / "x.rbp", RPC)
 
 
 @pytest.mark.parametrize("name", ["image_RPC.TXT", "image.RPB"])

@@ -5,7 +5,8 @@ Lagrange's polynomial of degree 7, so that the tables continue four rows beyond 
 on a straight line, distorted by cubic polynomials; and no corrections. So
 
 - the step of the tables is halved until the polynomials follow the trajectory between the rows, or
-  until more rows would only add rounding: n rows leave some n·ε/2 of the distance from the Earth's
+  until three more halvings come no nearer: polynomials through tables that are coarser than those
+  of the image oscillate by chance; and n rows leave some n·ε/2 of the distance from the Earth's
   centre, since their times differ in the last digits;
 - rows beyond the tables of the image continue its first and last rows by a polynomial;
 - corrections (aberration, refraction, light time) go into the attitude: with the point X on the
@@ -41,6 +42,8 @@ from jaxbundle.types import AnyArray, Scalar
 
 # Degree of `m_platformFlag` 1: with as many rows on each side, four beyond the ends.
 DEGREE, SIDE_ROWS = 7, 4
+# Halvings of the step that come no nearer, before the search for it ends.
+MAX_HALVINGS = 3
 # From our camera frame, which looks along −z, to that of the state.
 TURN = np.diag([1.0, -1.0, -1.0])
 
@@ -92,7 +95,7 @@ def write_csm_state(
     source = _Source(image, earth, height, sights)
     # 16 intervals of a second: usual tables have 1 to 100 rows a second
     intervals = int(max(16, np.ceil(16 * (last_time - first_time))))
-    best = None
+    best, halvings_without_gain = None, 0
     while best is None or 2 * intervals <= max_rows:
         t, P, R = _tables(source, first_time, last_time, intervals)
         middles = first_time + (last_time - first_time) * (np.arange(intervals) + 0.5) / intervals
@@ -103,10 +106,11 @@ def write_csm_state(
         error = np.linalg.norm(P_found - true_poses[0], axis=1).max()
         error += distance * (R_found.inv() * Rotation.from_matrix(true_poses[1])).magnitude().max()
         error += len(t) * np.finfo(float).eps / 2 * np.linalg.norm(P[0])
-        if best is not None and error > best[0]:
-            break
-        best = float(error), t, P, R
-        if error <= tolerance:
+        if best is None or error < best[0]:
+            best, halvings_without_gain = (float(error), t, P, R), 0
+        else:
+            halvings_without_gain += 1
+        if error <= tolerance or halvings_without_gain == MAX_HALVINGS:
             break
         intervals *= 2
     assert best is not None

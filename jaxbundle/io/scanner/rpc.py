@@ -9,7 +9,7 @@ products (`rpc_vendor_files`).
 
 In all of them line 0, sample 0 is the centre of the first pixel, degrees and metres, as in `Rpc`.
 Scales may be negative, as from some providers. Errors in a file (ERR_BIAS, ERR_RAND) are read by
-`read_stated_errors`, limits (MIN_LONG, …) are left, and none of them are written. Keys that are
+`read_stated_errors`, and written where they are given; limits (MIN_LONG, …) are left. Keys that are
 not known are told, or refused (`io.text.known_keys`); not in keyword lists of OSSIM, which hold the
 state of the whole program.
 """
@@ -105,6 +105,9 @@ class StatedErrors(NamedTuple):
     random: float = 0.0
 
 
+NOT_STATED = StatedErrors()
+
+
 def read_rpc(path: str | Path, unknown: UnknownKeys | None = None) -> Rpc:
     """The coefficients of a text file, an RPB file, a raster with RPC tags, or of a product.
 
@@ -155,19 +158,24 @@ def read_stated_errors(path: str | Path) -> StatedErrors:
     return StatedErrors(**{name: number(word) for name, word in texts.items() if word is not None})
 
 
-def write_rpc(path: str | Path, rpc: Rpc) -> None:
+def write_rpc(path: str | Path, rpc: Rpc, errors: StatedErrors = NOT_STATED) -> None:
     """Write coefficients for `read_rpc`, exact to the last digit (15 in a GeoTIFF).
 
-    `.rpb`: RPB; `.tif`: the tags of a GeoTIFF that exists; anything else: text.
+    `.txt`: text; `.rpb`: RPB; `.tif`: the tags of a GeoTIFF that exists. `errors`: those of the
+    coefficients (`read_stated_errors` of the file they are from); none are written for 0.
+
+    **Raises:** `InputError` for another ending, and where the file cannot be written.
     """
     path = Path(path)
     match path.suffix.lower():
+        case ".txt":
+            write_text(path, _plain_text(rpc, errors))
         case ".rpb":
-            write_text(path, _rpb_text(rpc))
+            write_text(path, _rpb_text(rpc, errors))
         case suffix if suffix in RASTERS:
-            _to_raster(path, rpc)
+            _to_raster(path, rpc, errors)
         case _:
-            write_text(path, _plain_text(rpc))
+            raise InputError(f"{path}: coefficients end in .txt, .rpb or, of a raster, .tif")
 
 
 def _from_text(path: Path, text: str, unknown: UnknownKeys) -> dict[str, Any]:
@@ -266,7 +274,7 @@ def _from_raster(path: Path) -> dict[str, Any]:
     return values
 
 
-def _to_raster(path: Path, rpc: Rpc) -> None:
+def _to_raster(path: Path, rpc: Rpc, errors: StatedErrors) -> None:
     package = rasterio()
     from rasterio.rpc import RPC
 
@@ -276,6 +284,8 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
         tags[f"{key}_scale"] = float(getattr(rpc, f"{axis}_scale"))
     for field, (name, _) in FIELDS.items():
         tags[name.lower()] = np.asarray(getattr(rpc, field)).tolist()
+    # None: GDAL writes −1, an unknown error of RPC00B.
+    tags |= {"err_bias": errors.bias or None, "err_rand": errors.random or None}
     if not path.is_file():
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
@@ -291,8 +301,9 @@ def _to_raster(path: Path, rpc: Rpc) -> None:
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
 
 
-def _plain_text(rpc: Rpc) -> str:
-    lines = []
+def _plain_text(rpc: Rpc, errors: StatedErrors) -> str:
+    named = {"ERR_BIAS": errors.bias, "ERR_RAND": errors.random}
+    lines = [f"{name}: {value!r} meters" for name, value in named.items() if value]
     for part in ("OFF", "SCALE"):
         for axis, (name, _) in OFFSETS.items():
             value = float(getattr(rpc, f"{axis}_{'offset' if part == 'OFF' else 'scale'}"))
@@ -303,9 +314,10 @@ def _plain_text(rpc: Rpc) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _rpb_text(rpc: Rpc) -> str:
+def _rpb_text(rpc: Rpc, errors: StatedErrors) -> str:
     lines = ['satId = "";', 'bandId = "";', 'SpecId = "RPC00B";', "BEGIN_GROUP = IMAGE"]
-    lines += ["\terrBias = 0.0;", "\terrRand = 0.0;"]
+    named = {"errBias": errors.bias, "errRand": errors.random}
+    lines += [f"\t{name} = {value!r};" for name, value in named.items() if value]
     for part in ("Offset", "Scale"):
         for axis, (_, key) in OFFSETS.items():
             lines.append(f"\t{key}{part} = {float(getattr(rpc, f'{axis}_{part.lower()}'))!r};")
