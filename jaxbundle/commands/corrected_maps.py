@@ -142,7 +142,7 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
         raise InputError("--occlusion: needs terrain; give --dem")
     file = open_image(scanner, tell, picture)
     map_errors = None if sigma is None else _errors_of(errors or {}, file, Path(scanner))
-    surface = surface_under(file.image, file.earth, height, dem, geoid, tell)
+    surface = surface_under(file, height, dem, geoid, tell)
     system = MapSystem(file.earth, crs)
     terrain = None if dem is None else Path(dem)
     grid = map_of(file.image, surface, system, spacing, terrain, tell=tell)

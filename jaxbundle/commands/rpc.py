@@ -143,7 +143,8 @@ def apply(
     `project_points`, `locate_points_on`.
 
     **Arguments:** `coefficients`: any file that holds some; `points`: table longitude, latitude,
-    height[, id] (degrees, metres), or line, sample[, id]; surface and `tell` as of `locate`.
+    height[, id] (degrees, metres), line, sample[, id], or what `locate` wrote, whose ground is
+    projected; surface and `tell` as of `locate`.
 
     **Raises:** `InputError`, also if no point has a solution.
     """
@@ -151,14 +152,18 @@ def apply(
     rpc, table = read_rpc(Path(coefficients), unknown), read_csv(Path(points))
     for message in unknown.messages():
         tell(message)
-    if "line" in table.values:
-        table.check_names(("line", "sample"), ("id",))
+    is_located = "pixel" in table.values and "sample" not in table.values
+    optional = ("id", *LOCATED_COLUMNS, *COLUMNS[3:]) if is_located else ("id",)
+    table = _as_rpc_table(table, tell) if is_located else table
+    # Of what `locate` wrote the ground is projected, and its lines and pixels are left.
+    if "line" in table.values and not {*COLUMNS[:3]} <= {*table.values}:
+        table.check_names(("line", "sample"), optional)
         place = [table.numbers(name, required=True) for name in ("line", "sample")]
         surface = surface_of(WGS84, height, dem, rpc, geoid)
         east, north, h, status = map(np.asarray, locate_points_on(rpc, surface, *place))
         columns = dict(zip(COLUMNS, (np.degrees(east), np.degrees(north), h, *place)))
     else:
-        table.check_names(COLUMNS[:3], ("id",))
+        table.check_names(COLUMNS[:3], optional)
         place = geographic(table)
         line, sample, status = map(np.asarray, project_points(rpc, *place))
         columns = dict(zip(COLUMNS, (*np.degrees(place[:2]), place[2], line, sample)))

@@ -96,7 +96,7 @@ def info(
     """
     file = open_image(scanner, tell)
     image = file.image
-    surface = surface_under(image, file.earth, height, None, None, tell)
+    surface = surface_under(file, height, None, None, tell)
     kind = "rational polynomials" if isinstance(image, RpcImage) else "rigorous"
     figures: dict[str, Any] = {
         "scanner": file.name,

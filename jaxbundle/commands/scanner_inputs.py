@@ -17,7 +17,7 @@ from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.rpc.image import RpcImage, heights_in_words, heights_of
+from jaxbundle.pushbroom.rpc.image import RpcImage, heights_of
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, GroundSurface, Height, Plane
 from jaxbundle.pushbroom.terrain import Terrain
@@ -116,28 +116,29 @@ def open_image(
 
 
 def surface_under(
-    image: PushbroomImage | RpcImage,
-    earth: Ellipsoid | None,
+    file: ScannerInput | RpcInput,
     height: float | None,
     dem: str | Path | None,
     geoid: str | Path | None,
     tell: Message,
 ) -> GroundSurface:
-    """`surface_of` for an image: without height and terrain the ellipsoid, or, where polynomials do
-    not hold there, the middle of their heights; `tell` receives that, and a surface for which they
-    do not hold."""
-    if not isinstance(image, RpcImage):
-        return surface_of(earth, height, dem, image, geoid)
-    low, high = heights_of(image.rpc)
-    domain = f"the RPC holds for heights from {heights_in_words(image.rpc)} m"
+    """`surface_of` for an image: without height and terrain the ellipsoid, or, where its
+    polynomials or those of its product do not hold there, the middle of their heights; `tell`
+    receives that, and a surface for which polynomials do not hold."""
+    image, is_rational = file.image, isinstance(file, RpcInput)
+    heights = heights_of(file.image.rpc) if isinstance(file, RpcInput) else file.rpc_heights
+    if heights is None:
+        return surface_of(file.earth, height, dem, image, geoid)
+    low, high = heights
+    domain = f"the RPC holds for heights from {low:.10g} to {high:.10g} m"
     if height is None and dem is None and not low <= 0 <= high:
         height = (low + high) / 2
         tell(f"{domain}, not for 0: the ground is taken at {height:.6g} m; give --height or --dem")
-    surface = surface_of(earth, height, dem, image, geoid)
+    surface = surface_of(file.earth, height, dem, image, geoid)
     ground_heights = [height or 0.0]
     if isinstance(surface, Terrain):
         ground_heights = [float(surface.lowest), float(surface.highest)]
-    if min(ground_heights) < low or max(ground_heights) > high:
+    if is_rational and (min(ground_heights) < low or max(ground_heights) > high):
         words = " to ".join(f"{h:.6g}" for h in ground_heights)
         tell(f"{domain}; the ground is at {words} m, where it is extrapolated")
     return surface

@@ -99,8 +99,8 @@ def locate(
       the file of the coefficients.
     - `points`: table line, pixel[, id]; without it a `grid` of lines × pixels over the image.
     - `height`: of the ground, metres above the ellipsoid (Z in a local frame), default 0, or, where
-      polynomials do not hold for 0, the middle of their heights; or `dem`: terrain raster,
-      with `geoid`: geoid heights, where its heights are orthometric.
+      polynomials, or those of its product, do not hold for 0, the middle of their heights; or
+      `dem`: terrain raster, with `geoid`: geoid heights, where its heights are orthometric.
     - `tell`: called with every warning.
 
     **Returns:** columns line, pixel, X, Y, Z, on the Earth longitude, latitude (degrees), height,
@@ -109,7 +109,7 @@ def locate(
     **Raises:** `InputError`, also if no position meets the surface.
     """
     file = open_image(scanner, tell)
-    surface = surface_under(file.image, file.earth, height, dem, geoid, tell)
+    surface = surface_under(file, height, dem, geoid, tell)
     ids, line, pixel, source = places(file.image, points, grid)
     is_off = off_image(file.image, line, pixel, source, tell)
     X, extrapolated = _locate(file.image, surface, line, pixel)

@@ -102,6 +102,25 @@ def test_there_and_back(tmp_path, run):
     assert [row["status"] for row in rows] == ["inside the domain"] * 2
 
 
+def test_the_ground_that_locate_wrote_is_projected(tmp_path, run):
+    """Its lines and pixels, of another model, are not taken for positions to be located."""
+    write_rpc(tmp_path / "a.txt", RPC)
+    true = table_of(RPC, (3, 3, 2))
+    names = ("line", "pixel", "X", "Y", "Z", "longitude", "latitude", "height", "status")
+    rows = [
+        (line + 7, sample - 3, 0.0, 0.0, 0.0, np.degrees(east), np.degrees(north), h, "on ground")
+        for east, north, h, line, sample in np.array(true).T
+    ]
+    write_csv(tmp_path / "located.csv", names, rows)
+    status, out, _ = run(
+        "apply", tmp_path / "a.txt", "--points", tmp_path / "located.csv", "--json", "-"
+    )
+    found = json.loads(out)["rows"]
+    assert status == 0
+    np.testing.assert_allclose([row["line"] for row in found], true.line, atol=1e-6)
+    np.testing.assert_allclose([row["sample"] for row in found], true.sample, atol=1e-6)
+
+
 def test_a_bias_is_removed(tmp_path, run):
     write_rpc(tmp_path / "a.txt", RPC)
     true = table_of(RPC, (3, 3, 2))

@@ -32,6 +32,7 @@ from jaxbundle.pushbroom.rpc.agreement import (
     Agreement,
     compare_with_rpc,
 )
+from jaxbundle.pushbroom.rpc.image import heights_of
 from jaxbundle.pushbroom.rpc.polynomials import Rpc
 
 
@@ -59,7 +60,7 @@ def check_against_rpc(
         scanner = _warn(scanner, message)
     image = scanner.image
     usual = _compare(image, rpc, (image.corrections,))[0]
-    scanner = dataclasses.replace(scanner, agreement=usual)
+    scanner = dataclasses.replace(scanner, agreement=usual, rpc_heights=heights_of(rpc))
     if _agree(usual, random_error):
         return scanner
     if not np.isfinite(usual.rms):

@@ -11,7 +11,8 @@ from jaxbundle.pushbroom.rpc.agreement import Agreement
 class ScannerInput:
     """The image, the ellipsoid of its Earth (None: a local frame), warnings of the reader;
     `backwards`: whether its clock runs against time, so that no correction can be applied;
-    `agreement` with the RPC of the product, if it has any."""
+    `agreement` with the RPC of the product, if it has any, and the heights for which these
+    hold."""
 
     name: str
     image: PushbroomImage
@@ -19,3 +20,4 @@ class ScannerInput:
     warnings: tuple[str, ...] = ()
     backwards: bool = False
     agreement: Agreement | None = None
+    rpc_heights: tuple[float, float] | None = None
