@@ -8,7 +8,11 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate
-from jaxbundle.adjustment.mirrored_control import name_mirrored, name_other_side
+from jaxbundle.adjustment.mirrored_control import (
+    name_mirrored,
+    name_other_side,
+    name_view_from_below,
+)
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.control import read_control, with_control
 from jaxbundle.network.unit_mistakes import (
@@ -373,3 +377,11 @@ def test_numbers_that_cannot_be_computed_with_end_in_one_line(command, tmp_path,
     told = command("adjust", path, "--out", tmp_path / "out")
     assert told.status == 2 and said in told.err and not (tmp_path / "out").exists()
     assert len(told.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("omega, said", [(0.1, ""), (np.pi - 0.2, "4 of 4 look up")])
+def test_photographs_that_look_up_at_control_are_named(omega, said):
+    images = np.zeros((4, 6))
+    images[:, 3] = omega
+    words = name_view_from_below(images)
+    assert said in words and bool(words) == bool(said)

@@ -7,6 +7,7 @@ Turned images are none of this: κ takes them.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -94,6 +95,22 @@ def name_other_side(network: Network, images: dict[str, Float[np.ndarray, "3"]])
     return (
         f"{count(int(is_on_other_side.sum()), 'image')} of {len(rows)} moved from the start value "
         f"to the other side of the control points, where their mirror image is seen: {REMEDY}"
+    )
+
+
+def name_view_from_below(images: Float[np.ndarray, "images 6"]) -> str:
+    """That most images look up within 45° of the zenith, in words; else empty. Control on nearly
+    level ground fits a flight as well in the mirror: seen from below.
+
+    **Arguments:** `images`: centres, and ω, φ, κ in radians, in a system with heights."""
+    # The camera looks along −z: the direction's height is −cos ω·cos φ.
+    height = -np.cos(images[:, 3]) * np.cos(images[:, 4])
+    looking_up = int((height > math.sqrt(0.5)).sum())
+    if 2 * looking_up <= len(images):
+        return ""
+    return (
+        f"{count(looking_up, 'photograph')} of {len(images)} look up at the control points, from "
+        f"below the ground if this is a flight: its mirror image fits, so {REMEDY}"
     )
 
 

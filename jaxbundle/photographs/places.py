@@ -92,7 +92,7 @@ def to_map(
         return X, ""
     zone = re.fullmatch(r"WGS84 +UTM +(\d+) *([NS])", system.strip(), re.IGNORECASE)
     if zone:
-        return X, f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}"
+        system = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}"
     pyproj = _need_pyproj()
     try:
         crs = pyproj.CRS.from_user_input("EPSG:4326" if system.upper() == "WGS84" else system)
@@ -106,6 +106,13 @@ def to_map(
                 "σ and distances are metres here: give the coordinates in a system in metres, such "
                 "as the UTM zone"
             )
+        # Other descriptions than the code do not have its area.
+        crs = pyproj.CRS.from_epsg(code) if code else crs
+        if not _is_in_area(X[:, :2], crs) and _is_in_area(X[:, 1::-1], crs):
+            raise InputError(
+                f"{where}: {X[0, 0]:.10g}, {X[0, 1]:.10g} lies outside of {system}, and within it "
+                "the other way round: expected X (easting), then Y (northing)"
+            )
         return X, f"EPSG:{code}" if code else crs.to_string()
     target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
     outside = (abs(X[:, 1]) > 90) | (abs(X[:, 0]) > 360)
@@ -116,6 +123,23 @@ def to_map(
         )
     x, y = _transformer(crs, target, where).transform(X[:, 0], X[:, 1])
     return np.stack([x, y, X[:, 2]], 1), target
+
+
+def _is_in_area(xy: Float[np.ndarray, "n 2"], crs: Any) -> bool:
+    """Whether most places are in the area of use of a system; true where that is not known."""
+    area = crs.area_of_use
+    if area is None:
+        return True
+    # Coordinates continue into the neighbouring zone, of six degrees in UTM.
+    margin, number = 6.0, len(xy)
+    longitude, latitude = _transformer(crs, "EPSG:4326", "control").transform(*xy.T)
+    from_west = np.mod(np.asarray(longitude) - area.west + margin, 360)
+    width = np.mod(area.east - area.west, 360) or 360.0
+    is_inside = (from_west <= width + 2 * margin) & (
+        np.abs(np.asarray(latitude) - (area.south + area.north) / 2)
+        <= (area.north - area.south) / 2 + margin
+    )
+    return 2 * int(is_inside.sum()) > number
 
 
 def _transformer(source: Any, target: str, where: str) -> Any:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from jaxbundle.adjustment.mirrored_control import name_view_from_below
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
@@ -283,9 +284,12 @@ class _ReconstructionRun:
             at_once,
             self.tell,
         )
-        for name, of_photograph in zip(self.names, features):
+        for name, of_photograph, read in zip(self.names, features, readers):
             # Fewer than the matches that must agree in a pair.
             if (number := len(of_photograph)) < self.settings.verification.min_matches:
+                # Features kept by an earlier run do not say that the file is damaged.
+                if number == 0 and name not in self.left_out:
+                    read()
                 self.left_out.setdefault(name, f"no texture: {count(number, 'feature')}")
         self._require_two()
         return features
@@ -499,6 +503,10 @@ class _ReconstructionRun:
                 )
             self._begin("")
         result = weighted.adjustment
+        if control is not None and self.system:
+            below = name_view_from_below(result.image_values)
+            if below:
+                self._warn(f"{name}: {below}", np.inf)
         if settings.correlated:
             result = result.with_correlated_errors()
         exif = {photograph.name: photograph.exif for photograph in self.photographs}

@@ -54,6 +54,23 @@ def test_geojson_has_what_rfc_7946_wants(result, tmp_path):
     json.dumps(document, allow_nan=False)
 
 
+def test_control_and_check_points_have_their_differences(result, tmp_path):
+    given = result.network
+    names = [given.points.id[k] for k in (4, 5)]
+    role = tuple("check" if id in names else r for id, r in zip(given.points.id, given.points.role))
+    points = dataclasses.replace(given.points, role=role)
+    checked = jaxbundle.adjust(given.replace(points=points))
+    write_geopackage(checked, tmp_path / "a.gpkg")
+    with sqlite3.connect(tmp_path / "a.gpkg") as database:
+        rows = database.execute("SELECT id, X, Y, Z, dX, dY, dZ, geom FROM checks").fetchall()
+        control = database.execute("SELECT id, dX, probability FROM control").fetchall()
+    assert [row[0] for row in rows] == names and len(control) == 4
+    for row, place in zip(rows, given.points.position[[4, 5]]):
+        np.testing.assert_allclose(np.subtract(row[1:4], row[4:7]), place, atol=1e-9)
+        assert struct.unpack("<3d", row[7][-24:]) == row[1:4]
+    assert [row[1] for row in control] == pytest.approx(checked.table("control")["dX"].tolist())
+
+
 def test_ellipses_are_those_of_the_covariance(result, tmp_path):
     write_geopackage(result, tmp_path / "a.gpkg", factor=1000.0)
     with sqlite3.connect(tmp_path / "a.gpkg") as database:
@@ -89,7 +106,7 @@ def test_a_geopackage_has_its_tables(result, tmp_path, crs, number):
         assert systems >= {-1, 0, 4326, number}
         contents = database.execute("SELECT table_name, srs_id FROM gpkg_contents").fetchall()
         assert contents == [
-            (name, number) for name in ("points", "stations", "ellipses")
+            (name, number) for name in ("points", "control", "stations", "ellipses")
         ]
         kinds = dict(database.execute("SELECT table_name, z FROM gpkg_geometry_columns").fetchall())
         assert kinds == {"points": 1, "stations": 1, "ellipses": 0}

@@ -3,6 +3,8 @@
 | layer | geometry | attributes |
 |---|---|---|
 | points | point Z | id, role, X, Y, Z, sX, sY, sZ, rays |
+| control | point Z | id, dX, dY, dZ (predicted by all others − given), their σ, probability |
+| checks | point Z | id, X, Y, Z, dX, dY, dZ (intersected − given), sX, sY, sZ, rays |
 | stations | point Z | id, camera, X0, Y0, Z0, omega, phi, kappa, their σ |
 | ellipses | polygon | id, of, a, b (semi-axes of the standard ellipse in plan), bearing, factor |
 
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 CORNERS = 36
 # "GPKG" as a number, and version 1.3 (OGC 12-128r18, requirement 2).
 APPLICATION, VERSION = 0x47504B47, 10300
-LAYERS = ("points", "stations", "ellipses")
+LAYERS = ("points", "control", "checks", "stations", "ellipses")
 UNDEFINED = -1
 
 
@@ -177,6 +179,15 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
                 "rays": int(points["rays"][row]),
             },
         )
+    place_of = dict(zip(points["id"].tolist(), coordinates))
+    for layer in ("control", "checks"):
+        columns = result.table(layer)
+        for values in zip(*(np.asarray(column).tolist() for column in columns.values())):
+            row_of_table = dict(zip(columns, values))
+            given_place = [row_of_table.get(axis) for axis in "XYZ"]
+            place = np.array(place_of.get(row_of_table["id"], given_place), float)
+            if np.isfinite(place).all():
+                yield Feature(layer, place, row_of_table)
     cameras = [result.network.cameras[c].id for c in result.network.images.camera]
     sigmas = [f"s{name}" for name in EXTERIOR]
     for row, centre in enumerate(result.image_values[:, :3]):
