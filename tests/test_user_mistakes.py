@@ -379,7 +379,7 @@ def test_numbers_that_cannot_be_computed_with_end_in_one_line(command, tmp_path,
     assert len(told.err.strip().splitlines()) == 1
 
 
-@pytest.mark.parametrize("omega, said", [(0.1, ""), (np.pi - 0.2, "4 of 4 look up")])
+@pytest.mark.parametrize("omega, said", [(0.1, ""), (np.pi - 0.2, "4 photographs of 4 look up")])
 def test_photographs_that_look_up_at_control_are_named(omega, said):
     images = np.zeros((4, 6))
     images[:, 3] = omega

@@ -109,7 +109,7 @@ def test_a_geopackage_has_its_tables(result, tmp_path, crs, number):
             (name, number) for name in ("points", "control", "stations", "ellipses")
         ]
         kinds = dict(database.execute("SELECT table_name, z FROM gpkg_geometry_columns").fetchall())
-        assert kinds == {"points": 1, "stations": 1, "ellipses": 0}
+        assert kinds == {"points": 1, "control": 1, "stations": 1, "ellipses": 0}
         rows = database.execute("SELECT geom, X, Y, Z, sZ FROM points").fetchall()
     for (blob, *place, sigma), s in zip(rows, result.points["sZ"]):
         assert blob[:4] == b"GP\x00\x01" and struct.unpack("<i", blob[4:8]) == (number,)
