@@ -16,6 +16,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix
+from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test
 from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
 from jaxbundle.network.blunders import Removed
@@ -332,7 +333,23 @@ def refine(
     for weak in weaknesses(inspection.declared, inspection.solution):
         warnings.append(f"{weak.sentence}; only priors, if any, separate them")
     check = intersect(inspection, check_rays) if len(check_rays.points) else None
-    return Refinement(inspection, check, tuple(warnings))
+    result = Refinement(inspection, check, tuple(warnings))
+    return dataclasses.replace(
+        result, warnings=(*result.warnings, *_beyond_priors(result, significance))
+    )
+
+
+def _beyond_priors(result: Refinement, significance: float) -> Iterator[str]:
+    """Unknowns that leave their priors by more than chance explains, as a warning."""
+    ratio = np.abs(result.estimate) / result.prior_sigma
+    limit = normal_quantile(1 - significance / 2)
+    beyond = sorted(np.flatnonzero(ratio > limit), key=lambda k: -ratio[k])
+    if beyond:
+        listed = list_some([f"{result.names[k]} ({ratio[k]:.3g} σ)" for k in beyond], 3, str)
+        yield (
+            f"beyond their priors: {listed}; check heights (ellipsoid or geoid, metres or feet) "
+            "and the system of the points, or the priors"
+        )
 
 
 def _without_terrain(inspection: RefinementInspection) -> Iterator[str]:

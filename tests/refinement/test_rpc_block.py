@@ -284,3 +284,12 @@ def test_together_with_a_photograph():
     error = (result.estimate[of_rpc] - bias.ravel()) / result.inspection.sigma[of_rpc]
     assert np.abs(error).max() < 3 and result.global_test()["passed"]
     assert result.inputs.ids[-1] == "F" and min(result.rays()) >= 4
+
+
+def test_what_leaves_its_prior_is_named(case):
+    """Biases of the stated size are within their priors; priors of a hundredth of it are left."""
+    (images, *others), _, result = case
+    assert not any("beyond their priors" in line for line in result.warnings)
+    tight = [dataclasses.replace(one, bias_sigma=one.bias_sigma / 100) for one in images]
+    (said,) = [w for w in refine(tight, *others).warnings if "beyond their priors" in w]
+    assert "check heights" in said
