@@ -45,7 +45,7 @@ from jaxbundle.types import not_none
 Matrix = Float[np.ndarray, "n m"]
 
 
-class Segments(NamedTuple):
+class ColumnSegments(NamedTuple):
     """Ranges of columns of a sparse matrix that none of its rows crosses: where they begin, with
     the number of all columns behind; by row its segment (−1: the row is empty); the matrix with the
     columns of every row counted from the first of its segment."""
@@ -78,7 +78,7 @@ class RootColumns(NamedTuple):
 
     narrow: Any
     wide: Any
-    segments: Segments
+    segments: ColumnSegments
     mixing: list[tuple[slice, Matrix | None]]
     many: Any | None
     of_components: list[slice | None]
@@ -196,7 +196,7 @@ def _subtract_fit(
     c: Clusters,
     W: Batch,
     segments: Sequence[tuple[int, slice]],
-    of_wide: Segments,
+    of_wide: ColumnSegments,
 ) -> None:
     """WᵀPW = WᵀW − (QᵀW)ᵀ·QᵀW: three rows of QᵀW for a point instead of all of its rays."""
     parts = []
@@ -212,7 +212,7 @@ def _subtract_fit(
             wide[others, columns] -= product.T
 
 
-def segments_of(F: Any) -> Segments:
+def segments_of(F: Any) -> ColumnSegments:
     """The segments of a sparse matrix."""
     import scipy.sparse as sp
 
@@ -231,7 +231,7 @@ def segments_of(F: Any) -> Segments:
     width = int(np.diff(begin).max(initial=0))
     indices = F.indices - np.repeat(begin[of_row], count).astype(F.indices.dtype)
     within = sp.csr_matrix((F.data, indices, F.indptr), (F.shape[0], width))
-    return Segments(begin, of_row, within)
+    return ColumnSegments(begin, of_row, within)
 
 
 def gram(F: Any) -> Matrix:
