@@ -294,8 +294,8 @@ def make_problem(
             f"{error.defect} of 7 parameters are open: give at least three free points that "
             "are not collinear (datum_points), or omit the setting"
         ) from None
-    if problem.plan.datum is None and control_is_weak(
-        network, engine.information_of_motions(problem), problem.counts.observations
+    if problem.information is not None and control_is_weak(
+        network, problem.information, problem.counts.observations
     ):
         retraction = TurnAboutSeen(problem.declared, moves_as_one=True)
         problem = dataclasses.replace(problem, retraction=retraction)

@@ -17,7 +17,12 @@ from jaxbundle.arguments import one_of, show
 from jaxbundle.choices import REDUCTIONS
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
-from jaxbundle.leastsquares.datum.defect import find_open_motions, make_datum, survey_motions
+from jaxbundle.leastsquares.datum.defect import (
+    Survey,
+    find_open_motions,
+    make_datum,
+    survey_motions,
+)
 from jaxbundle.leastsquares.declarations import Kind, Motions, ObservationSet, Table
 from jaxbundle.leastsquares.indexing.indices import Sizes, common, finish, round_up
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
@@ -43,7 +48,9 @@ from jaxbundle.types import AnyArray, Scalar, not_none
 @dataclasses.dataclass(frozen=True)
 class Problem:
     """A problem: declarations, plan and numbers. `sizes`: of the lists of the plan; `choices`:
-    those of its planning (`planner.make_plan`)."""
+    those of its planning (`planner.make_plan`); `information`: of its motions, GᵀJᵀPJG of all
+    observations that one changes, at the start values (None: some are open, or would move what is
+    held)."""
 
     tables: tuple[Table, ...]
     observations: tuple[ObservationSet, ...]
@@ -54,6 +61,7 @@ class Problem:
     choices: dict
     counts: "SystemCounts"
     retraction: Callable
+    information: Float[np.ndarray, "motions motions"] | None
 
     @property
     def planning(self) -> PlanningSettings:
@@ -156,6 +164,7 @@ def make_problem(
         *planned[1:],
         count(tables, data),
         (retraction or Retraction)(declared),
+        None,
     )
     problem = problem if motions is None else _with_datum(problem, datum)
     # Sorting more observations than this leaves megabytes in the allocator.
@@ -211,7 +220,7 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     survey = survey_motions(problem.declared, problem.plan, data, real)
     gauge = find_open_motions(survey)
     if not gauge.shape[1]:
-        return problem
+        return dataclasses.replace(problem, information=_information(problem, survey))
     if choose is None:
         raise InputError(f"the datum is open in {gauge.shape[1]} parameters: give `datum`")
     weight, minimal = choose(gauge)
@@ -225,18 +234,12 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     return dataclasses.replace(problem, plan=plan, counts=counts)
 
 
-def information_of_motions(problem: Problem) -> Float[np.ndarray, "motions motions"]:
-    """GᵀJᵀPJG of the declared motions G, of all observations that a motion changes, at the start
-    values; `nan` where unknowns are held that a motion would move."""
-    motions = not_none(problem.declared.motions)
-    moved, number = [name for name, _ in motions.actions], len(motions.names)
+def _information(problem: Problem, survey: Survey) -> Float[np.ndarray, "motions motions"] | None:
+    moved = [name for name, _ in not_none(problem.declared.motions).actions]
     if any((t.free == 0).any() for t in problem.tables if t.name in moved):
-        return np.full((number, number), np.nan)
-    data = pad_data(problem, problem.data)
-    real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
-    survey = survey_motions(problem.declared, problem.plan, data, real)
-    products = np.concatenate([np.zeros((0, number)), *map(np.asarray, survey.products)])
-    return products.T @ products
+        return None
+    products = [np.asarray(product) for product in survey.products]
+    return sum((x.T @ x for x in products), np.zeros((survey.squares.shape[0],) * 2))
 
 
 def with_motions_at(problem: AnyProblem, values: Values) -> AnyProblem:

@@ -157,6 +157,7 @@ def control_is_weak(
     that length for one σ are what an adjustment takes anyway, and more are crept.
     """
     scale = np.sqrt(np.diagonal(information))
+    # Motions without any effect, or values that are not finite.
     if not (scale > 0).all():
         return False
     cofactor = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
