@@ -192,7 +192,7 @@ def test_files_that_do_not_fit_are_named(folder, monkeypatch, capsys):
 def test_stated_errors_are_read(folder, scene):
     rpb, text = (folder / "b.RPB").read_text(), (folder / "c_RPC.TXT").read_text()
     assert read_stated_errors(folder / "b.RPB") == (0.0, 0.0)
-    (folder / "b.RPB").write_text(rpb.replace("errBias = 0.0", "errBias = 6.0"))
+    (folder / "b.RPB").write_text(rpb.replace("\tline", "\terrBias = 6.0;\n\tline", 1))
     assert read_stated_errors(folder / "b.RPB") == (6.0, 0.0)
     (folder / "c_RPC.TXT").write_text("ERR_BIAS: 3.5 meters\nERR_RAND: 0.25\n" + text)
     assert read_stated_errors(folder / "c_RPC.TXT") == (3.5, 0.25)
