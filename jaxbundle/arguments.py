@@ -153,7 +153,7 @@ def refuse_unknown(name: str, options: Mapping[str, Any], known: Callable[..., A
 
     **Raises:** `TypeError`, as Python does, but naming the function that was called."""
     names = [*inspect.signature(known).parameters]
-    for option in options.keys() - {*names}:
+    for option in sorted(options.keys() - {*names}):
         raise TypeError(
             f"{name}() has no argument {option!r}; beside its own it takes {', '.join(names)}"
         )

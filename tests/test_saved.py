@@ -90,6 +90,8 @@ def test_observations_of_ones_own_are_asked_for(network, tmp_path):
     assert again.report() == result.report()
     with pytest.raises(InputError, match=r"height.*also="):
         jaxbundle.load_adjustment(tmp_path / "a.npz")
+    with pytest.raises(TypeError, match=r"height.*use save"):
+        pickle.dumps(result)
 
 
 @pytest.mark.parametrize("content", [b"", b"X,Y,Z\n1,2,3\n", b"PK\x03\x04 and no more", None])

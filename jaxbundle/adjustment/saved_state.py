@@ -23,6 +23,8 @@ from jaxbundle.io.results.stored_tree import fingerprint, write_tree
 from jaxbundle.leastsquares.quality.error_components import ErrorSettings, SizeEquations
 from jaxbundle.leastsquares.quality.names import Name
 from jaxbundle.network.blunders import Removed, Suspect
+from jaxbundle.network.columns import list_some
+from jaxbundle.network.declare import declare
 from jaxbundle.network.kinds import KINDS
 from jaxbundle.network.tables import (
     Camera,
@@ -192,7 +194,16 @@ def store(adjustment: Any, path: str | Path) -> None:
 
 
 def saved_bytes(adjustment: Any) -> bytes:
-    """The content of the file that `store` writes."""
+    """The content of the file that `store` writes.
+
+    **Raises:** `TypeError` with tables or observations of one's own, which the file only names."""
+    problem = adjustment.problem
+    declared = declare(problem.network, problem.origin, lengths=problem.lengths)
+    if own := {o.name for o in problem.observations} - {o.name for o in declared.observations}:
+        raise TypeError(
+            f"an adjustment with observations of one's own ({list_some(sorted(own))}) is not "
+            "pickled, since they are functions: use save, and load_adjustment with also=[…]"
+        )
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "adjustment"
         adjustment.save(file)

@@ -33,6 +33,7 @@ from jaxbundle.io import adjusted_network
 from jaxbundle.io.cameras.opencv_writing import opencv_text
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
 from jaxbundle.io.networks.colmap import fill_colmap
+from jaxbundle.io.networks.losses import METRIC_FORMATS
 from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
@@ -43,6 +44,7 @@ from jaxbundle.io.writing.folders import replace_folder
 from jaxbundle.network.conversion import convert_cameras
 from jaxbundle.network.kinds import Rigs
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.units import METRES
 from jaxbundle.plotting import write_figures
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
@@ -71,8 +73,6 @@ RIG_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "ros-stereo": ("camera_info", ROS_FILES),
     "anipose": ("calibration.toml", ()),
 }
-# Those that have metres; the others keep the unit of the board.
-IN_METRES = ("kalibr", "mrcal", "ros-stereo")
 STEREO_PAIRS = "stereo_*.yaml"
 # Models that OpenCV and COLMAP have.
 FOREIGN = ("opencv", "kannala-brandt")
@@ -280,8 +280,9 @@ def _lengths_of_rig(network: Network) -> str:
     unit, (reference, *others) = network.object_unit, network.images.id
     bases = np.linalg.norm(network.images.position - network.images.position[0], axis=1)[1:]
     distances = ", ".join(f"{name!r} {base:.4g} {unit}" for name, base in zip(others, bases))
-    in_metres = ", ".join(name for kind, (name, _) in RIG_FILES.items() if kind in IN_METRES)
-    return f"distances from {reference!r}: {distances}; {in_metres}: in metres, others in {unit}"
+    metric = ", ".join(name for kind, (name, _) in RIG_FILES.items() if kind in METRIC_FORMATS)
+    units = f"; {metric} are in metres, the other files in {unit}" if unit in METRES else ""
+    return f"distances from {reference!r}: {distances}{units}"
 
 
 def fill_comparison(

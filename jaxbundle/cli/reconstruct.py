@@ -171,8 +171,9 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     if surface:
         _surface(out, photos[0], force, quiet)
     judge.end(judgement)
-    if any(part.no_control for part in result.parts):
+    if reasons := [part.no_control for part in result.parts if part.no_control]:
         # The network is solved, but not where control was to put it: a script has to see that.
+        typer.echo(f"jaxbundle: control is not used: {reasons[0]}", err=True)
         raise typer.Exit(NOT_SOLVED)
 
 

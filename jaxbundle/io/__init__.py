@@ -22,7 +22,7 @@ _HOME = {
     "jaxbundle.io.networks.micmac_camera": ("write_autocal",),
     "jaxbundle.io.networks.mrcal": ("write_cameramodel", "write_mrcal"),
     "jaxbundle.io.networks.openmvg": ("write_openmvg",),
-    "jaxbundle.io.networks.opensfm": ("write_opensfm",),
+    "jaxbundle.io.networks.opensfm_writing": ("write_opensfm",),
     "jaxbundle.io.networks.opensfm_objects": ("from_opensfm",),
     "jaxbundle.io.networks.photo_list": ("read_photo_list",),
     "jaxbundle.io.networks.project": ("read_project", "write_project"),

@@ -36,8 +36,8 @@ from jaxbundle.io.networks.micmac_camera import write_autocal as write_autocal
 from jaxbundle.io.networks.mrcal import write_cameramodel as write_cameramodel
 from jaxbundle.io.networks.mrcal import write_mrcal as write_mrcal
 from jaxbundle.io.networks.openmvg import write_openmvg as write_openmvg
-from jaxbundle.io.networks.opensfm import write_opensfm as write_opensfm
 from jaxbundle.io.networks.opensfm_objects import from_opensfm as from_opensfm
+from jaxbundle.io.networks.opensfm_writing import write_opensfm as write_opensfm
 from jaxbundle.io.networks.photo_list import read_photo_list as read_photo_list
 from jaxbundle.io.networks.project import read_project as read_project
 from jaxbundle.io.networks.project import write_project as write_project

@@ -31,8 +31,12 @@ from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
 from jaxbundle.io.networks.mrcal import MRCAL_LOSSES, fill_mrcal, write_cameramodel
 from jaxbundle.io.networks.mrcal import OFFERED_MODELS as MRCAL_MODELS
 from jaxbundle.io.networks.openmvg import OPENMVG_LOSSES, write_openmvg
-from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
-from jaxbundle.io.networks.opensfm import OPENSFM_LOSSES, fill_opensfm, write_opensfm_cameras
+from jaxbundle.io.networks.opensfm_writing import FILES as OPENSFM_FILES
+from jaxbundle.io.networks.opensfm_writing import (
+    OPENSFM_LOSSES,
+    fill_opensfm,
+    write_opensfm_cameras,
+)
 from jaxbundle.io.networks.project import FILE_NAME, fill_project
 from jaxbundle.io.networks.project import FILES as PROJECT_FILES
 from jaxbundle.io.networks.realityscan import FILES as REALITYSCAN_FILES

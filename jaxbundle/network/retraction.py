@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.leastsquares.datum.conditions import free_of_tables
+from jaxbundle.leastsquares.datum.conditions import generators, move_tables
 from jaxbundle.leastsquares.datum.motions import ROTATION
 from jaxbundle.leastsquares.equations.normal import Rows, sum_over_devices
 from jaxbundle.leastsquares.indexing.plan import Plan, Tangent
@@ -20,7 +20,7 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.kinds.image_points import ImagePoint
 from jaxbundle.network.noise import noise_of_rays
 from jaxbundle.network.tables import Network
-from jaxbundle.types import AnyArray, not_none
+from jaxbundle.types import AnyArray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +48,9 @@ class TurnAboutSeen:
         if not self.moves_as_one:
             return self._turn(plan, values, changes)
         motion = _motion_of_images(plan, values["image"], changes["image"])
-        remaining = _without_motion(self.declared, motion, values, changes)
-        return _move(self.declared, plan, motion, self._turn(plan, values, remaining))
+        directions = generators(self.declared, {name: values[name] for name in changes})
+        remaining = {name: change - directions[name] @ motion for name, change in changes.items()}
+        return move_tables(self.declared, plan, motion, self._turn(plan, values, remaining))
 
     def _turn(self, plan: Plan, values: Values, changes: dict[str, Rows]) -> Values:
         retracted = retract_tables(self.declared, values, changes)
@@ -99,7 +100,7 @@ class TurnAboutSeen:
 def _motion_of_images(plan: Plan, images: PoseValue, changes: Rows) -> Float[Array, "7"]:
     """The similarity nearest to a change of images: the mean of their rotations in object space,
     then the shift and the scale that fit what their positions move beside."""
-    free = plan.groups["image"].free.all(1, keepdims=True)
+    free = plan.groups["image"].free[:, :6].all(1, keepdims=True)
     mean = lambda x: jnp.sum(jnp.where(free, x, 0.0), 0) / jnp.maximum(free.sum(), 1)
     # A turn r of the object is −M·r in the frame of the camera (`geometry.helmert_pose`).
     M = jax.vmap(matrix_from_quaternion)(images.rotation)
@@ -110,35 +111,6 @@ def _motion_of_images(plan: Plan, images: PoseValue, changes: Rows) -> Float[Arr
     scale = mean(jnp.sum(X * moved, 1, keepdims=True)) / jnp.where(square > 0, square, 1.0)
     shift = mean(moved) - scale * mean(images.position)
     return jnp.concatenate([shift, turn, scale])
-
-
-def _without_motion(
-    declared: Declared, motion: Float[Array, "7"], values: Values, changes: dict[str, Rows]
-) -> dict[str, Rows]:
-    """The changes of tables beside those by a motion, to first order."""
-    remaining = dict(changes)
-    for name, act in not_none(declared.motions).actions:
-        if name in changes:
-            space, near = declared.spaces[name], getattr(act, "near", act)
-            difference = getattr(space, "small_difference", space.difference)
-            change = lambda m, value, near=near, difference=difference: difference(
-                near(m, value), value
-            )
-            along = lambda value, change=change: jax.jvp(
-                lambda m: change(m, value), (jnp.zeros(7),), (motion,)
-            )[1]
-            remaining[name] = changes[name] - jax.vmap(along)(values[name])
-    return remaining
-
-
-def _move(declared: Declared, plan: Plan, motion: Float[Array, "7"], values: Values) -> Values:
-    """The tables after a motion; held unknowns stay."""
-    moved, free = dict(values), free_of_tables(declared, plan, values)
-    for name, act in not_none(declared.motions).actions:
-        space, move = declared.spaces[name], getattr(act, "move", act)
-        row = lambda value, f, space=space, move=move: space.hold(move(motion, value), value, f)
-        moved[name] = jax.vmap(row)(values[name], free[name])
-    return moved
 
 
 def control_is_weak(
@@ -157,8 +129,8 @@ def control_is_weak(
     that length for one σ are what an adjustment takes anyway, and more are crept.
     """
     scale = np.sqrt(np.diagonal(information))
-    # Motions without any effect, or values that are not finite.
-    if not (scale > 0).all():
+    # Without rays, with motions without any effect, or with values that are not finite.
+    if not len(network.observations) or not (scale > 0).all():
         return False
     cofactor = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     variance = np.linalg.eigvalsh(cofactor[ROTATION, ROTATION]).max()

@@ -24,8 +24,8 @@ Matrices = Float[np.ndarray, "images 3 3"]
 Centres = Float[np.ndarray, "images 3"]
 
 EXPECTED = (
-    "X0, Y0, Z0 is the projection centre, and M = R3(kappa)·R2(phi)·R1(omega) leads from the "
-    "object to the camera, which has x right and y up and looks along −z"
+    "the projection centre X0, Y0, Z0, and the angles of M = R3(kappa)·R2(phi)·R1(omega), which "
+    "leads from the object to a camera with x right and y up that looks along −z"
 )
 ANGLE_NAMES = np.array(["omega", "phi", "kappa"])
 
@@ -74,7 +74,7 @@ def _in_other_units(
 
 def _in_conventions(angles: Angles, centres: Centres) -> Iterator[tuple[str, Matrices, Centres]]:
     """Other meanings of the same numbers, the usual ones first."""
-    remedy = f": expected are those of which {EXPECTED}; convert them in the input"
+    remedy = f"; expected are {EXPECTED}: convert them in the input"
     G = batched.matrices(angles)
     for is_vision, is_inverse, is_translation in itertools.product([False, True], repeat=3):
         R = _transposed(G) if is_inverse else G
@@ -91,7 +91,7 @@ def _in_conventions(angles: Angles, centres: Centres) -> Iterator[tuple[str, Mat
         if order != (0, 1, 2):
             given = ", ".join(ANGLE_NAMES[list(np.argsort(order))])
             yield (
-                f"the columns omega, phi, kappa hold {given}{remedy}",
+                f"omega, phi, kappa are in fact {given}{remedy}",
                 batched.matrices(angles[:, order]),
                 centres,
             )

@@ -5,6 +5,7 @@ unchanged: above sea level by EXIF, but many drones write them above the ellipso
 the take-off point, so the assumed reference is reported with them.
 """
 
+import importlib.util
 import re
 from collections.abc import Sequence
 from types import ModuleType
@@ -93,14 +94,17 @@ def to_map(
     zone = re.fullmatch(r"WGS84 +UTM +(\d+) *([NS])", system.strip(), re.IGNORECASE)
     if zone:
         system = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}"
+        # It is known without pyproj, which only finds exchanged axes.
+        if importlib.util.find_spec("pyproj") is None:
+            return X, system
     pyproj = _need_pyproj()
     try:
         crs = pyproj.CRS.from_user_input("EPSG:4326" if system.upper() == "WGS84" else system)
     except pyproj.exceptions.ProjError:
         raise InputError(f"{where}: coordinate system {system!r} is not known") from None
     if not crs.is_geographic:
-        code, axis = crs.to_epsg(), crs.axis_info[0]
-        if axis.unit_conversion_factor != 1:
+        code = crs.to_epsg()
+        for axis in (axis for axis in crs.axis_info if axis.unit_conversion_factor != 1):
             raise InputError(
                 f"{where}: {system} is in {axis.unit_name} ({axis.unit_conversion_factor:.9g} m); "
                 "σ and distances are metres here: give the coordinates in a system in metres, such "
@@ -114,13 +118,13 @@ def to_map(
                 "the other way round: expected X (easting), then Y (northing)"
             )
         return X, f"EPSG:{code}" if code else crs.to_string()
-    target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
     outside = (abs(X[:, 1]) > 90) | (abs(X[:, 0]) > 360)
     for longitude, latitude, _ in X[outside]:
         raise InputError(
             f"{where}: {longitude:g}, {latitude:g} is no place in {system}: expected longitude, "
             "then latitude, in degrees"
         )
+    target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
     x, y = _transformer(crs, target, where).transform(X[:, 0], X[:, 1])
     return np.stack([x, y, X[:, 2]], 1), target
 
@@ -132,13 +136,13 @@ def _is_in_area(xy: Float[np.ndarray, "n 2"], crs: Any) -> bool:
         return True
     # Coordinates continue into the neighbouring zone, of six degrees in UTM.
     margin, number = 6.0, len(xy)
+    # Infinite where the projection has no such place.
     longitude, latitude = _transformer(crs, "EPSG:4326", "control").transform(*xy.T)
-    from_west = np.mod(np.asarray(longitude) - area.west + margin, 360)
+    with np.errstate(invalid="ignore"):
+        from_west = np.mod(np.asarray(longitude) - area.west + margin, 360)
     width = np.mod(area.east - area.west, 360) or 360.0
-    is_inside = (from_west <= width + 2 * margin) & (
-        np.abs(np.asarray(latitude) - (area.south + area.north) / 2)
-        <= (area.north - area.south) / 2 + margin
-    )
+    middle, half = (area.south + area.north) / 2, (area.north - area.south) / 2
+    is_inside = (from_west <= width + 2 * margin) & (abs(latitude - middle) <= half + margin)
     return 2 * int(is_inside.sum()) > number
 
 

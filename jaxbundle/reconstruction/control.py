@@ -115,8 +115,8 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
         image = cells[5]
         if "." not in image:
             raise InputError(
-                f"{path}, line {number}: {image!r} is no file name; a name with blanks needs tabs "
-                "between the columns"
+                f"{path}, line {number}: photograph {image!r} has no ending, such as .jpg; a name "
+                "with blanks needs tabs between the columns"
             )
         # Without a name rows of one point are known by their equal coordinates, as text.
         name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
@@ -131,11 +131,17 @@ def _cells(line: str) -> list[str]:
 
 
 def _is_sighting(cells: Sequence[str]) -> bool:
-    """Whether cells are five numbers and a photograph."""
+    """Whether cells are five numbers and a photograph, which is none: id, X, Y, Z and their σ, in a
+    table without a header, are numbers, too."""
+    return [_is_number(cell) for cell in cells[:6]] == [True] * 5 + [False]
+
+
+def _is_number(cell: str) -> bool:
     try:
-        return len([float(cell) for cell in cells[:5]]) == 5 and len(cells) > 5
+        float(cell)
     except ValueError:
         return False
+    return True
 
 
 def _read_table(

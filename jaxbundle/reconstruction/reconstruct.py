@@ -496,11 +496,7 @@ class _ReconstructionRun:
                 )
             except (InputError, NotSolvedError) as error:
                 no_control = str(error)
-                self._warn(
-                    f"{name}: control is not used, and position, orientation and scale are "
-                    f"arbitrary: {error}",
-                    np.inf,
-                )
+                self._warn(f"{name}: control is not used: {error}", np.inf)
             self._begin("")
         result = weighted.adjustment
         if control is not None and self.system:
@@ -514,12 +510,14 @@ class _ReconstructionRun:
         absolute = control is not None or self.further.positions is not None
         block = describe_block(result, exif, self.system if absolute else "")
         part = ReconstructedPart(name, result, weighted.factors, block, control, no_control)
-        if not (absolute or self.further.distances or no_control):
-            self.notes.append(
-                f"{name}: position, orientation and scale are arbitrary: control points "
-                "(--control), distances between targets (--targets, --distances) or positions in "
-                "the files of the photographs determine them"
+        if not (absolute or self.further.distances):
+            remedy = (
+                "control could not be used"
+                if no_control
+                else "control points (--control), distances between targets (--targets, "
+                "--distances) or positions in the files of the photographs determine them"
             )
+            self.notes.append(f"{name}: position, orientation and scale are arbitrary: {remedy}")
         if part.misfit >= DOUBTFUL_MISFIT:
             self._warn(f"{name}: {misfit_in_words(part)}", part.misfit)
         return part

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import cv2
 import numpy as np
 import pytest
 import wand_scenes as scenes
@@ -198,7 +199,6 @@ SMALL_CAMERAS = {
 def filmed(tmp_path_factory):
     """A wand of three markers before two cameras: photographs of one, a video of the other; and
     where the markers are."""
-    cv2 = pytest.importorskip("cv2")
     home, rng, ends = tmp_path_factory.mktemp("wand"), np.random.default_rng(1), scenes.wave(24)
     (home / "c0").mkdir()
     video = cv2.VideoWriter(str(home / "c1.avi"), cv2.VideoWriter.fourcc(*"FFV1"), 30, SMALL, True)

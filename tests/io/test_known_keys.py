@@ -14,7 +14,7 @@ from jaxbundle.io import read_cameras, read_network
 from jaxbundle.io.cameras.camera_files import is_camera_file
 from jaxbundle.io.cameras.nearest_camera import fit_messages
 from jaxbundle.io.networks.micmac import write_micmac
-from jaxbundle.io.networks.opensfm import write_opensfm
+from jaxbundle.io.networks.opensfm_writing import write_opensfm
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys, may_change_geometry
 

@@ -10,7 +10,7 @@ from exchange_cases import assert_same, network
 
 import jaxbundle
 from jaxbundle.errors import InputError
-from jaxbundle.io.networks.opensfm import write_opensfm
+from jaxbundle.io.networks.opensfm_writing import write_opensfm
 
 NAMES = ("a.jpg", "b.jpg", "c d.jpg")
 

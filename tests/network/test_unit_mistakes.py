@@ -202,4 +202,5 @@ def test_angles_in_another_order_are_told(order, words):
     names = ["omega", "phi", "kappa"]
     columns = given.images.angles[:, [names.index(word) for word in words.split(", ")]]
     images = dataclasses.replace(given.images, angles=columns)
-    assert f"omega, phi, kappa hold {words}:" in name_angle_convention(given.replace(images=images))
+    said = name_angle_convention(given.replace(images=images))
+    assert f"omega, phi, kappa are in fact {words};" in said

@@ -1,5 +1,6 @@
 """Products with a rigorous model and RPC: both are compared when they are read."""
 
+import dataclasses
 from pathlib import Path
 
 import equinox as eqx
@@ -11,8 +12,10 @@ from test_rpc_products import digitalglobe
 from test_rpc_products import dimap as dimap_rpc
 from test_xml_products import dimap, worldview
 
+from jaxbundle.commands.scanner_inputs import surface_under
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
+from jaxbundle.io.scanner.csm_writing import write_csm_state
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 from jaxbundle.pushbroom import rpc as polynomials
@@ -152,6 +155,30 @@ def test_states_adjusted_by_another_program_are_read():
     """Lengths of quaternions from 0.99992 to 1.00029: less than is worth a word."""
     found = read_scanner(FOLDER / "jitter_solved_a.adjusted_state.json")
     assert found.warnings == ()
+
+
+@pytest.mark.parametrize("height, expected, said", [
+    (None, 3443.0, "from 2942 to 3944 m, not for 0: the ground is taken at 3443 m"),
+    (100.0, 100.0, ""),
+])  # fmt: skip
+def test_without_a_height_the_ground_is_where_the_rpc_hold(
+    uncorrected, tmp_path, height, expected, said
+):
+    product = read_scanner(with_rpc(tmp_path, uncorrected))
+    low, high = product.rpc_heights
+    assert low <= 0 <= high
+    high_up, told = dataclasses.replace(product, rpc_heights=(2942.0, 3944.0)), []
+    assert surface_under(high_up, height, None, None, told.append).level == expected
+    assert len(told) == bool(said) and said in "".join(told)
+
+
+@real
+@pytest.mark.further
+def test_a_state_follows_worldview_1(tmp_path):
+    """Its tables are coarser than those of the product at first, and come no nearer by chance."""
+    product = read_scanner(FOLDER / "wv01.xml")
+    fit = write_csm_state(tmp_path / "state.json", product.image, product.earth, height=3443.0)
+    assert fit.trajectory < 1.5e-4 and 0.03 < fit.corrections < 0.05
 
 
 @real

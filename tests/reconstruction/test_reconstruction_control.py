@@ -71,6 +71,9 @@ def test_tables_with_and_without_measurements(tmp_path):
     np.testing.assert_allclose(other.points.sigma, [[0.1, 0.1, 0.2]])
     listed = written(tmp_path, "EPSG:32633\n1\t2\t3\t4\t5\tFlug Süd.jpg\tGCP 02\n")
     assert read_control_measurements(listed).sightings == (("Flug Süd.jpg", "GCP 02"),)
+    # A table without a header, of coded targets: seven numbers are no image point
+    bare = read_control_measurements(written(tmp_path, "45 1 2 3 0.1 0.1 0.2\n46 2 2 3 1 1 1\n"))
+    assert bare.points.id == ("45", "46") and bare.sightings == ()
 
 
 @pytest.mark.parametrize("text, said", [
@@ -82,7 +85,7 @@ def test_tables_with_and_without_measurements(tmp_path):
     ("EPSG:4326\n34.4 -119.9 0 4 5 a.jpg P\n", "34.4, -119.9 is no place in EPSG:4326"),
     ("EPSG:32611\n3814000 235000 0 4 5 a.jpg P\n", "outside of EPSG:32611, and within it"),
     ("1 2 3 4 5 a.jpg P\n", "line 1: the first line of a list .* names its coordinate system"),
-    ("EPSG:32633\n1 2 3 4 5 Flug Süd.jpg P\n", "line 2: 'Flug' is no file name"),
+    ("EPSG:32633\n1 2 3 4 5 Flug Süd.jpg P\n", "line 2: photograph 'Flug' has no ending"),
     ("id,X,Y,Z,image,u,v\nP,1,2,x,a.jpg,1,2\n", "line 2: z is 'x'"),
     ("id,X,Y,Z,sX,image,u,v\nP,1,2,3,-1,a.jpg,1,2\n", "line 2: sX, sY, sZ must be positive"),
     ("id,X,Y,Z,sX,image,u,v\nP,1,2,3,1,a.jpg,1,2\nP,1,2,3,2,b.jpg,1,2\n", "P has another σ"),

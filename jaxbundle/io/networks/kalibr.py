@@ -248,7 +248,7 @@ def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
 
     **Raises:** `InputError` for a camera without a model in Kalibr, or without image size.
     """
-    network, losses = mountings_in_metres(network, "Kalibr")
+    network, losses = mountings_in_metres(network, "kalibr")
     mountings, lines = mountings_of(network), []
     if mountings is None and len(network.cameras) > 1:
         losses.append("mountings of the cameras")

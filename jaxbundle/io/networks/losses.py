@@ -47,17 +47,21 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
             )
 
 
+# Formats whose lengths are metres, with the names of their programs.
+METRIC_FORMATS = MappingProxyType({"kalibr": "Kalibr", "mrcal": "mrcal", "ros-stereo": "ROS"})
+
+
 def mountings_in_metres(network: Network, format: str) -> tuple[Network, list[str]]:
-    """A network with the positions of its images in metres, for a format whose lengths are metres,
-    and what has to be said of a unit that is no length."""
+    """A network with the positions of its images in metres, for one of `METRIC_FORMATS`, and what
+    has to be said of a unit that is no length."""
     images, unit = network.images, network.object_unit
     if unit in METRES:
         images = dataclasses.replace(images, position=METRES[unit] * images.position)
         return network.replace(images=images, object_unit="m"), []
     known = np.isfinite(images.position) & (images.position != 0)
     remark = (
-        f"the unit of lengths: {format} expects metres, and those of the network, in {unit!r}, are "
-        "written as they are (if they are millimetres, say --set object_unit=mm)"
+        f"the unit of lengths: {METRIC_FORMATS[format]} expects metres, and lengths in {unit!r} "
+        "are written as they are (object_unit = mm, of convert --set object_unit=mm, converts them)"
     )
     return network, [remark] if known.any() else []
 

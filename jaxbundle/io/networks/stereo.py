@@ -228,7 +228,7 @@ def fill_ros_stereo(network: Network, folder: Path) -> tuple[str, ...]:
 
     **Returns, raises:** as `write_opencv_stereo`; `InputError` if no pair can be rectified.
     """
-    network, losses = mountings_in_metres(network, "ROS")
+    network, losses = mountings_in_metres(network, "ros-stereo")
     pairs = _pairs(network, "a pair of ROS")
     texts, failures = {}, []
     for pair in pairs:

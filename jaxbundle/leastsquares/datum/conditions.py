@@ -211,7 +211,7 @@ def move_to_datum(
         newton_slope = jax.jacfwd(_datum_misclosure)(no_motion, (declared, plan), (values, start))
         slope = jnp.where(previous_distance > DATUM_MOTION.near * size, slope, newton_slope)
         step = limit_step(datum.gauge @ -jnp.linalg.solve(slope, misclosure), curved)
-        displaced = _move(declared, plan, step, values)
+        displaced = move_tables(declared, plan, step, values)
         differences = {
             name: jax.tree.map(jnp.subtract, displaced[name], values[name]) for name in datum.weight
         }
@@ -345,7 +345,7 @@ def _datum_misclosure(
     plan = keep_held_fixed(declared, plan, values)
     datum = not_none(plan.datum)
     tables = {name: values[name] for name in datum.weight}
-    displaced = _move(declared, plan, datum.gauge @ tau, tables)
+    displaced = move_tables(declared, plan, datum.gauge @ tau, tables)
     return _conditions_of_tables(declared, plan, displaced, start)[0]
 
 
@@ -359,7 +359,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
 
     def move_along(tau: Float[Array, " defect"], of: Values, values: Values) -> Values:
         datum = not_none(keep_held_fixed(declared, plan, of).datum)
-        return _move(declared, plan, datum.gauge @ tau, values)
+        return move_tables(declared, plan, datum.gauge @ tau, values)
 
     # First remove the remaining motion, so that derivatives are taken at zero motion.
     constants = jax.lax.stop_gradient((values, start))
@@ -375,7 +375,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     return move_along(tau, values, values)
 
 
-def _move(
+def move_tables(
     declared: Declared, plan: Plan, motion: Float[AnyArray, " motions"], values: Values
 ) -> Values:
     """All tables moved, except held values."""
