@@ -81,7 +81,12 @@ def read_control_measurements(path: str | Path) -> Control:
     # Three formats, told apart by the first line: column names, a coordinate system, anything else.
     for separator in SEPARATORS:
         head = [cell.strip().lower() for cell in rows[0][1].split(separator)]
-        if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
+        if "image" in head:
+            if missing := [name for name in COLUMNS if name not in head]:
+                raise InputError(
+                    f"{path}, line {rows[0][0]}: a table of measurements has the columns "
+                    f"{', '.join(COLUMNS)}; missing: {', '.join(missing)}"
+                )
             return _read_table(path, head, rows[1:], separator)
     first_line = rows[0][1].strip()
     if first_line.upper().startswith(("EPSG:", "WGS84", "+PROJ", "PROJCS", "GEOGCS")):
@@ -95,6 +100,8 @@ def read_control_measurements(path: str | Path) -> Control:
     return Control(points, (), np.zeros((0, 2)), np.zeros(0))
 
 
+# Of a table of measurements, at least.
+COLUMNS = ("id", "x", "y", "z", "image", "u", "v")
 # Between the cells of a table.
 SEPARATORS = (",", ";", "\t")
 

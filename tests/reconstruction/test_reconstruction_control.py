@@ -84,6 +84,7 @@ def test_tables_with_and_without_measurements(tmp_path):
     ("EPSG:2229\n1 2 3 4 5 a.jpg P\n", r"is in US survey foot \(0.30480061 m\)"),
     ("EPSG:4326\n34.4 -119.9 0 4 5 a.jpg P\n", "34.4, -119.9 is no place in EPSG:4326"),
     ("EPSG:32611\n3814000 235000 0 4 5 a.jpg P\n", "outside of EPSG:32611, and within it"),
+    ("id;X;Y;Z;image;u;w\nP;1;2;3;a.jpg;1;2\n", "line 1: a table of .*; missing: v"),
     ("1 2 3 4 5 a.jpg P\n", "line 1: the first line of a list .* names its coordinate system"),
     ("EPSG:32633\n1 2 3 4 5 Flug Süd.jpg P\n", "line 2: photograph 'Flug' has no ending"),
     ("id,X,Y,Z,image,u,v\nP,1,2,x,a.jpg,1,2\n", "line 2: z is 'x'"),
