@@ -1,4 +1,4 @@
-"""The options `jaxbundle adjust --gis FILE --crs EPSG:NUMBER`."""
+"""The options `--gis FILE --crs EPSG:NUMBER` of `adjust` and `reconstruct`."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,13 +19,25 @@ Gis = Annotated[
     ),
 ]
 Crs = Annotated[
-    str, typer.Option(metavar="EPSG:NUMBER", help="system of the object coordinates, for --gis")
+    str,
+    typer.Option(
+        metavar="EPSG:NUMBER",
+        help="system of the object coordinates, for --gis; `reconstruct` knows that of satellite "
+        "positions and of control that names it",
+    ),
 ]
 SUFFIXES = (".gpkg", ".geojson", ".json")
 
 
-def check_gis(gis: str, crs: str, inputs: Iterable[str | Path], force: bool = False) -> None:
-    """Refuse a file or a system that cannot be written, before the work.
+def check_gis(
+    gis: str,
+    crs: str,
+    inputs: Iterable[str | Path],
+    force: bool = False,
+    system_may_follow: bool = False,
+) -> None:
+    """Refuse a file or a system that cannot be written, before the work; `system_may_follow`: from
+    the photographs or their control.
 
     **Raises:** `InputError`."""
     from jaxbundle.cli.outputs import FORCE_ADVICE, check_file, check_json
@@ -41,7 +53,8 @@ def check_gis(gis: str, crs: str, inputs: Iterable[str | Path], force: bool = Fa
     check_file("--gis", gis, None, inputs)
     check_crs(crs)
     if suffix != ".gpkg":
-        require_transformation(crs)
+        if crs or not system_may_follow:
+            require_transformation(crs)
         check_json(gis, FORCE_ADVICE, "--gis")
     elif Path(gis).is_file() and not force:
         with Path(gis).open("rb") as file:
@@ -51,9 +64,20 @@ def check_gis(gis: str, crs: str, inputs: Iterable[str | Path], force: bool = Fa
 
 
 def write_gis(result: "Adjustment", gis: str, crs: str) -> None:
-    """Write the file of --gis, if one was asked for."""
+    """Write the file of --gis, if one was asked for.
+
+    **Raises:** `InputError` for GeoJSON of a frame without a map system."""
     from jaxbundle.io.results.gis import write_geojson, write_geopackage
 
-    if gis and result.converged:
-        write = write_geopackage if gis.lower().endswith(".gpkg") else write_geojson
-        write(result, gis, crs)
+    if not (gis and result.converged):
+        return
+    if gis.lower().endswith(".gpkg"):
+        write_geopackage(result, gis, crs)
+    elif crs:
+        write_geojson(result, gis, crs)
+    else:
+        raise InputError(
+            f"--gis {gis}: not written, all else is: GeoJSON has longitude and latitude, and the "
+            "photographs have neither positions nor control in a named system; give --crs, or "
+            "the name of a GeoPackage, which keeps local coordinates"
+        )

@@ -25,6 +25,7 @@ from jaxbundle.cli.certificate_options import (
     Details,
     Lengths,
 )
+from jaxbundle.cli.gis_output import Crs, Gis, check_gis, write_gis
 from jaxbundle.cli.judging import judge_of
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
@@ -79,6 +80,8 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     certificate: CertificateFile = "",
     details: Details = None,
     lengths: Lengths = None,
+    gis: Gis = "",
+    crs: Crs = "",
     brief: Annotated[
         bool, typer.Option("--brief", help="omit points and residuals from the JSON")
     ] = False,
@@ -112,6 +115,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
     # Before the search, which opens every photograph; after it the photographs are inputs, too.
     check_writable(json, out, COMMAND, FILES, files, force)
+    check_gis(gis, crs, files, force, system_may_follow=True)
     judged = CertificateOptions(accept, certificate, details, lengths)
     judge = judge_of(
         COMMAND, judged, {"--json": json, "--html": html}, out, files, models=["opencv"]
@@ -170,6 +174,8 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
         print(f"Report: {out / REPORT}, as a page: {out / PAGE}")
     if surface:
         _surface(out, photos[0], force, quiet)
+    # Last: GeoJSON of a frame that turned out to be arbitrary is refused, and all else is there.
+    write_gis(result.parts[0].adjustment, gis, crs or result.parts[0].block.epsg)
     judge.end(judgement)
     if reasons := [part.no_control for part in result.parts if part.no_control]:
         # The network is solved, but not where control was to put it: a script has to see that.

@@ -142,8 +142,8 @@ class Kind:
       scalars, which is faster for many observations.
     - `of`: the names of the tables it touches, one for each block (one table may be touched twice).
     - `axes`: names of the residuals ("x", "y"), for reports.
-    - `units`: of the residuals, for reports: "length", "angle" (radians) or "image", one word for
-      all or one for each; "" if they have another or none.
+    - `units`: of the residuals, for reports: "length", "angle" (radians), "image", "velocity" or
+      "time" (seconds), one word for all or one for each; "" if they have another or none.
     - `snooped`: how it is tested for blunders and removed: `"whole"` with all of its residuals,
       `"single"` each residual separately, `""` never, like priors.
     - `invariant`: unchanged by motions of the whole problem (see `Motions`), like image

@@ -160,7 +160,10 @@ def check_parts(network: Network) -> None:
     known_points = np.bincount(known_in_part[0], minlength=len(labels))
     priors = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
     priors = np.bincount(part, priors, minlength=len(labels))
-    loose_parts = np.flatnonzero((known_points < 3) & (priors < 6))
+    # Three known points hold a part with its scale, six priors one image and what it sees; else 7
+    # equations of both kinds are needed. Whether they suffice, the solution shows.
+    equations = 3 * known_points + priors
+    loose_parts = np.flatnonzero((known_points < 3) & (priors < 6) & (equations < 7))
     if len(loose_parts):
         size = np.bincount(part)
         smallest = loose_parts[size[loose_parts].argmin()]

@@ -55,6 +55,8 @@ def unit_words(network: Network) -> dict[str, tuple[float, str]]:
         "length": (1.0, network.object_unit),
         "angle": (1 / ANGLE_UNITS[network.angle_unit], network.angle_unit),
         "image": (1.0, network.image_unit),
+        "velocity": (1.0, f"{network.object_unit}/s"),
+        "time": (1.0, "s"),
     }
 
 

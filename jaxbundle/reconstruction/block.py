@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -70,6 +71,12 @@ class BlockFacts:
     points_per_photograph: float
     photographs_per_place: float | None
     positions: CameraPositions | None
+
+    @property
+    def epsg(self) -> str:
+        """The code of the coordinate system, EPSG:NUMBER; empty if it has none."""
+        code = re.match(r"EPSG:\d+", self.system)
+        return code[0] if code else ""
 
     def facts(self) -> list[tuple[str, str]]:
         """Names and values in words."""

@@ -3,6 +3,9 @@
 Every point is compared with its given coordinates by leave-one-out prediction
 (`orientation.control_consistency`), which estimates the σ of control where none is given; a ray
 that ends at another control point of its photograph is a wrong name.
+
+σ of control here: NaN is to be estimated, infinity an axis without control; `fixed` points are
+exact.
 """
 
 import dataclasses
@@ -119,13 +122,17 @@ def assess_control(
     )
 
 
-def with_heights_as_in_plane(control: Points, assessed: Assessment) -> Points:
-    """Control with the estimated σ in the plane as that of heights, where these have a smaller one:
-    a block that bends to a plane of zeros leaves no residuals that would show their errors."""
+def with_heights_as_in_plane(
+    control: Points, usable: Sequence[int], assessed: Assessment
+) -> Points:
+    """Control with the σ in the plane as that of heights, where these have a smaller one: a block
+    that bends to a plane of zeros leaves no residuals that would show their errors; `usable`: the
+    points of the assessment."""
     sigma = control.sigma.copy()
     estimated = _is_estimated(control, [2])[:, 0]
-    # One σ for all estimated ones.
-    plane = float(assessed.sigma[:, 0].max())
+    # All estimated ones have one σ; of stated ones the largest.
+    in_plane, is_estimated = assessed.sigma[:, 0], _is_estimated(control, [0])[list(usable), 0]
+    plane = float(in_plane[is_estimated if is_estimated.any() else slice(None)].max())
     if not estimated.any() or assessed.sigma[:, 2].max() >= plane:
         return control
     sigma[estimated, 2] = plane
@@ -172,11 +179,11 @@ def choose_control(
             if not assessed.used[n]:
                 choice.reasons[id] = _describe_error(assessed, n)
         elif point.good.any():
+            # Snooping took it from the block, and its rays meet in the frame of control.
             choice.used[k] = control.role[k] != "check"
         else:
             _settle_by_coordinates(block, choice, k, control, shift)
-        if choice.points[id].good.any() or id not in choice.reasons:
-            _name_wrong(block, choice, id)
+        _name_wrong(block, choice, id)
     _name_exchanged(block, control, choice, {k: n for k, n in row.items() if not assessed.used[n]})
     return choice
 
@@ -223,6 +230,7 @@ def _settle_by_coordinates(
             else "a check point needs two rays, it has 1"
         )
     elif agree.any():
+        # Without a position: two rays that do not meet do not tell which of the others is wrong.
         choice.points[id] = dataclasses.replace(point, good=agree)
         choice.used[k] = True
     else:

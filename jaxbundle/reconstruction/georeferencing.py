@@ -78,7 +78,7 @@ def georeference(
     usable, assessed = assess_control(block, control, usable, assumed)
     given_sigma = control.sigma
     if has_doubtful_heights(control):
-        control = with_heights_as_in_plane(control, assessed)
+        control = with_heights_as_in_plane(control, usable, assessed)
         usable, assessed = assess_control(block, control, usable, assumed)
     choice = choose_control(block, control, measured, usable, assessed, assumed)
     if not block.has_positions and choice.used.sum() < MIN_CONTROL:

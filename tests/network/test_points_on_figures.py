@@ -248,6 +248,20 @@ def test_what_is_wrong_is_named(simulated, table, row, message):
             one.check(simulated.network)
 
 
+def test_one_radius_of_a_figure_holds_for_all_rows_and_two_are_refused(simulated):
+    rows = [r for r in tables(SIGMA)["figures"] if r["type"] == "sphere"]
+    rows[1] |= {"radius": 2.0}
+    (figures,) = make_further({"figures": rows}, 1.0)
+    of_radius = lambda figures: next(
+        table for table in figures.declare(simulated.network, np.zeros(3)).tables
+        if table.name == "radius of sphere"
+    )  # fmt: skip
+    assert of_radius(figures).value.tolist() == [2.0] and not of_radius(figures).free.any()
+    rows[2] |= {"radius": 2.5}
+    with pytest.raises(InputError, match="radius of 2.5 here, but of 2 in .*row 2"):
+        make_further({"figures": rows}, 1.0)
+
+
 def test_too_few_points_are_refused(simulated):
     given = {"figures": [r for r in tables(SIGMA)["figures"] if r["type"] == "sphere"][:3]}
     network = simulated.network.replace(further=make_further(given, 1.0))

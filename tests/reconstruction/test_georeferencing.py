@@ -205,8 +205,14 @@ def test_heights_of_zero_have_the_sigma_of_the_plane_if_theirs_is_smaller():
     assert not has_doubtful_heights(stated)
     for height, expected in ((0.02, [np.nan, np.nan, 0.8]), (1.9, [np.nan] * 3)):
         assessed = SimpleNamespace(sigma=np.tile([0.8, 0.8, height], (3, 1)))
-        found = with_heights_as_in_plane(flat, assessed).sigma
+        found = with_heights_as_in_plane(flat, range(3), assessed).sigma
         np.testing.assert_array_equal(found, np.tile(expected, (4, 1)))
+    # A stated σ of one point in the plane is not that of the others' heights.
+    mixed = unknown.copy()
+    mixed[1, :2] = 5.0
+    assessed = SimpleNamespace(sigma=np.array([[0.8, 0.8, 0.02], [5, 5, 0.02], [0.8, 0.8, 0.02]]))
+    found = with_heights_as_in_plane(dataclasses.replace(flat, sigma=mixed), range(3), assessed)
+    np.testing.assert_array_equal(found.sigma[:, 2], np.full(4, 0.8))
 
 
 @pytest.mark.further

@@ -1,6 +1,7 @@
 """Rendered photographs of a scene and some that do not belong to it, reconstructed."""
 
 import dataclasses
+import json
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 from rendered_photographs import CAMERA, SIZE, F, corner, write_photographs
 
 import jaxbundle
+from jaxbundle.cli.gis_output import write_gis
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.result_json import read_calibrated
 from jaxbundle.io.results.result_json import result_text
@@ -169,6 +171,25 @@ def test_two_scenes_by_the_positions_in_their_files(tmp_path):
         assert set(ids) == {name for name in truth if name[0] == prefix}
         e = part.adjustment.image_values[:, :3] - [truth[id] for id in ids]
         assert np.abs(e).max() < 0.6
+    # Of the largest part, in the system of the positions.
+    largest, layers = found.parts[0], tmp_path / "block.geojson"
+    assert largest.block.epsg == "EPSG:32633"
+    write_gis(largest.adjustment, str(layers), largest.block.epsg)
+    features = json.loads(layers.read_text("utf-8"))["features"]
+    stations = {f["properties"]["id"]: f["geometry"]["coordinates"] for f in features
+                if f["properties"]["layer"] == "stations"}  # fmt: skip
+    to_map = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32633", always_xy=True).transform
+    for name, (longitude, latitude, height) in stations.items():
+        np.testing.assert_allclose((*to_map(longitude, latitude), height), truth[name], atol=0.6)
+
+
+def test_geojson_of_a_frame_without_a_system_is_refused(made, tmp_path):
+    (part,) = made[1].parts
+    assert part.block.epsg == ""
+    with pytest.raises(InputError, match="not written, all else is"):
+        write_gis(part.adjustment, str(tmp_path / "a.geojson"), part.block.epsg)
+    write_gis(part.adjustment, str(tmp_path / "a.gpkg"), part.block.epsg)
+    assert (tmp_path / "a.gpkg").exists() and not (tmp_path / "a.geojson").exists()
 
 
 def test_groups_of_connected_photographs():

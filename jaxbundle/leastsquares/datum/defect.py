@@ -81,6 +81,8 @@ def _survey(
     }
     products, squares = [], jnp.zeros(motions)
     for number, part in enumerate(plan.parts):
+        # Conditions such as points on a figure are invariant only where they hold: the residuals
+        # of start values would pass for observations of the scale.
         if declared.kinds[part.set_name].invariant:
             continue
         _, touches, E = differentiate(declared, plan, number, prepared, chunked)
@@ -183,6 +185,8 @@ def make_datum(
         weight = {
             t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
         }
+    # Pins make the reduced matrix regular (`elimination.reduced_system`); the solution does not
+    # depend on which are chosen.
     pins = _choose_pins(plan, along_gauge({name: survey.of_groups[name] for name in plan.kept}))
     held_unknowns = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
     held_unknowns = {t: mask for t, mask in held_unknowns.items() if mask.any()}

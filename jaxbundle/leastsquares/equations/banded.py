@@ -122,8 +122,8 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     m = width * w
     # Two rows at most one band width apart are in one super-block (0: D) or in two neighbouring
     # ones (1: E): this defines the width. One scatter for both.
-    diagonal_and_above = jnp.zeros((2, blocks, width, width, w, w))
-    diagonal_and_above = diagonal_and_above.at[0, place // width, place % width, place % width].set(
+    diagonal_and_below = jnp.zeros((2, blocks, width, width, w, w))
+    diagonal_and_below = diagonal_and_below.at[0, place // width, place % width, place % width].set(
         S.diagonal_blocks[g]
     )
     if (g, g) in S.off_diagonal_blocks:
@@ -134,10 +134,10 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
             (a < b)[:, None, None], S.off_diagonal_blocks[g, g].mT, S.off_diagonal_blocks[g, g]
         )
         beside = high // width - low // width
-        diagonal_and_above = diagonal_and_above.at[
+        diagonal_and_below = diagonal_and_below.at[
             beside, low // width, high % width, low % width
         ].add(turned)
-    D, E = diagonal_and_above.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)
+    D, E = diagonal_and_below.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)
     # Positions of padding get a one, so that every block has a factor; they are never read.
     unused = 1.0 - _into_band(plan, jnp.ones(plan.groups[g].free.shape))
     D = D + unused[:, :, None] * jnp.eye(m)

@@ -134,6 +134,7 @@ class UndampedStepState(eqx.Module):
     def begin(cls, settings: StoppingSettings) -> "UndampedStepState":
         """Before the first step."""
         no, near_limit = jnp.asarray(False), jnp.asarray(settings.near_solution)
+        # A predicted decrease of 0: no step is "less than half of the one before" at first.
         return cls(near_limit, jnp.asarray(0.0), no, no, no, jnp.asarray(0), settings)
 
     def choose_step(
@@ -217,6 +218,8 @@ class UndampedStepState(eqx.Module):
             (has_stalled & ~singular, RELATIVE_COST),
             ((small & undamped_rejected_too_often) | (has_stalled & singular), SINGULAR),
             (has_failed, SINGULAR),
+            # A small step is repeated without damping first. What is left cannot be computed
+            # however large λ is, or its decrement is rounding that does not fall with 1/λ.
             ((step_size < rules.shortest_step) & ~small, STUCK),
         )
         termination = jnp.asarray(LIMIT)

@@ -55,7 +55,7 @@ class SizeEquations:
         part = np.eye(len(self.T))
         if not self.has_others:
             return self.T, part
-        # V_0 without the given rows, whose part of the forms is known
+        # V_0 without the given rows, whose part of the forms is known: σ0² times their traces
         part[-1, 0] = -1
         T = part.T @ self.T @ part
         onto = part.T[:-1].copy()
@@ -65,7 +65,8 @@ class SizeEquations:
     def solve(
         self, q: Float[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """θ ≥ 0 and the scores, of all components."""
+        """θ ≥ 0 and the scores, of all components; the θ of `OTHERS`, which is added to that of
+        all independent errors, may be negative."""
         T, onto = self.reduced
         forms = onto @ q
         cubes = self.cubes
@@ -108,7 +109,7 @@ def widenings(
         if not (some > 0).any():
             continue  # independent errors alone
         # Of the θ that are not zero, in the system of these alone.
-        inverse = np.linalg.pinv(T[np.ix_(some, some)], 1e-10, hermitian=True)
+        inverse = inverse_of_traces(T[np.ix_(some, some)])
         covariance = inverse @ forms[np.ix_(some, some)] @ inverse
         sigma = np.sqrt(np.diag(covariance))
         rows = np.flatnonzero((positive == pattern).all(1))
@@ -152,6 +153,16 @@ def _median(
     return np.nanmedian(quotients, 1)
 
 
+# Relative eigenvalues of T below it are rounding: components that are combinations of others leave
+# them, at 1e-16 times the number of residuals summed.
+RANK_TOLERANCE = 1e-10
+
+
+def inverse_of_traces(T: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+    """T⁻¹, the pseudo-inverse where components are combinations of others."""
+    return np.linalg.pinv(T, RANK_TOLERANCE, hermitian=True)
+
+
 def _nonnegative(
     T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " k"]:
@@ -162,8 +173,7 @@ def _nonnegative(
     A = T / scale[:, None] / scale
     # T is symmetric and positive semidefinite: T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
     w, E = np.linalg.eigh(A)
-    # Components that are combinations of others leave eigenvalues of rounding.
-    some = w > 1e-10 * w.max()
+    some = w > RANK_TOLERANCE * w.max()
     L = E[:, some] * np.sqrt(w[some])
     right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
     return nnls(L.T, right)[0] / scale
@@ -176,13 +186,14 @@ def _significant(
     cubes: Float[np.ndarray, "k k k"] | None,
 ) -> Float[np.ndarray, " k"]:
     """θ ≥ 0 of the components whose θ is beyond the quantile that it has in the system of all that
-    are left, if errors are independent; the least significant is left out first."""
+    are left, if errors are independent; the least significant is left out first, and one at a time:
+    of two that explain the same residuals, both are short of it until one is left out."""
     # The mean square of all residuals: θ_0 may be zero, where others are in every observation.
     components, white = np.arange(len(q)), max(q[0] / T[0, 0], 0.0)
     while True:
         part = T[np.ix_(components, components)]
         theta = _nonnegative(part, q[components])
-        inverse = np.linalg.pinv(part, 1e-10, hermitian=True)
+        inverse = inverse_of_traces(part)
         # The covariance of q is 2·T·σ0⁴ for independent errors.
         sigma = np.sqrt(2 * np.diag(inverse))
         limit = np.full(len(components), critical)

@@ -106,7 +106,8 @@ class Antennas(ObservationTable):
         R = np.tile(np.eye(3), (len(table), 1, 1))
         for (i, j), name in zip(PAIRS, pairs):
             R[:, i, j] = R[:, j, i] = np.nan_to_num(table.numbers(name))
-        # Three correlations that are each below 1 may still be no covariance together.
+        # Three correlations that are each below 1 may still be no covariance together, and weights
+        # need its inverse: rounding leaves 1e-16 where it is singular. NaN fails, too.
         for row in np.flatnonzero(~(np.linalg.eigvalsh(R).min(1) > 1e-12))[:1]:
             raise InputError(
                 f"{table.source(row)}: the correlations {', '.join(pairs)} are impossible together"
@@ -140,7 +141,8 @@ class Antennas(ObservationTable):
         )
 
     def begin(self, network: Network) -> Network:
-        """Antenna positions serve as start values of projection centres."""
+        """Antenna positions serve as start values of projection centres: without the lever arm,
+        which needs the rotation."""
         images = network.images
         row = {id: k for k, id in enumerate(self.image)}
         position = images.position.copy()
@@ -201,8 +203,8 @@ class Antennas(ObservationTable):
         )
         priors = (
             *parameters.priors(arm, ARM, "length"),
-            *parameters.priors(shift, groups, "length"),
-            *parameters.priors(clock, ["time_offset"]),
+            *parameters.priors(shift, groups, ("length",) * 3 + ("velocity",) * 3),
+            *parameters.priors(clock, ["time_offset"], "time"),
         )
         return Contribution(
             (arm, shift, clock), (observations, *priors), (("GNSS strip", _shift_back),)

@@ -310,7 +310,9 @@ class Parameters:
         """Which of these are free, in every row."""
         return np.array([[name in self.free for name in names]])
 
-    def priors(self, table: Table, names: Sequence[str], units: str = "") -> list[ObservationSet]:
+    def priors(
+        self, table: Table, names: Sequence[str], units: str | tuple[str, ...] = ""
+    ) -> list[ObservationSet]:
         """Pseudo-observations of the start values of a table of vectors with these columns, in
         `units` (`Kind`)."""
         # An infinite σ is no prior: a column without one is a row without weight.

@@ -12,7 +12,8 @@ cylinder, and a radius; residuals are signed distances (Luhmann et al. 2014, 2.3
 | cylinder | √(x² + y²) − R | shifts along and rotations about x and y, R |
 
 Table `figures`, one row per point: `figure` (its name), `type`, `point`; `sigma` of the distance of
-the point, "exact" or empty: a thousandth of the σ of one ray; `radius` if known.
+the point, "exact" or empty: a thousandth of the σ of one ray; `radius` if known, in one or all rows
+of a figure.
 
 Table `shapes`, one row per point: `shape` (the name of one placement), `point`, its coordinates
 `x`, `y`, `z` in the frame of the shape, and `sigma` likewise: a board, a scale cross, with one name
@@ -127,6 +128,7 @@ class Figures(ObservationTable):
                     f"{table.source(row)}: type is {show(word)}{did_you_mean(word, TYPES)}"
                 )
         first_rows: dict[str, int] = {}
+        first_radius: dict[str, int] = {}
         for row, name in enumerate(figures.figure):
             first_row = first_rows.setdefault(name, row)
             if figures.type[row] != figures.type[first_row]:
@@ -136,6 +138,13 @@ class Figures(ObservationTable):
                 )
             if figures.type[row] not in ROUND and not np.isnan(figures.radius[row]):
                 raise InputError(f"{table.source(row)}: a {figures.type[row]} has no radius")
+            if not np.isnan(figures.radius[row]):
+                first_row = first_radius.setdefault(name, row)
+                if figures.radius[row] != figures.radius[first_row]:
+                    raise InputError(
+                        f"{table.source(row)}: {name!r} has a radius of {figures.radius[row]:g} "
+                        f"here, but of {figures.radius[first_row]:g} in {table.source(first_row)}"
+                    )
         return figures
 
     @property
@@ -170,9 +179,10 @@ class Figures(ObservationTable):
         names, figure = np.unique(np.array(self.figure, dtype=object)[rows], return_inverse=True)
         members = [rows[figure == k] for k in range(len(names))]
         for name, figure_rows in zip(names, members):
-            if len(np.unique(point[figure_rows])) < FEWEST[type]:
+            usable = len(np.unique(point[figure_rows]))
+            if usable < FEWEST[type]:
                 raise InputError(
-                    f"{self.source(figure_rows[0])}: {type} {name!r} has {len(figure_rows)} "
+                    f"{self.source(figure_rows[0])}: {type} {name!r} has {usable} "
                     f"usable points; at least {FEWEST[type]} are needed"
                 )
         centre, M, radius = (
