@@ -11,21 +11,43 @@ from jaxbundle.cli.certificate_options import Accept
 from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
-Sigma = Annotated[
-    float, typer.Option(min=0, help="standard deviation: degrees, metres, per second")
-]
-
 
 @pushbroom.command(example="out/flight/scanner.toml --attitude-white 0.01")
 def accuracy(  # noqa: PLR0913 - the options of the command
     scanner: ScannerFile,
     truth: Annotated[Path | None, typer.Option(help="scanner file of the truth")] = None,
-    attitude_bias: Sigma = 0.0,
-    attitude_drift: Sigma = 0.0,
-    attitude_white: Sigma = 0.0,
-    position_bias: Sigma = 0.0,
-    position_drift: Sigma = 0.0,
-    position_white: Sigma = 0.0,
+    attitude_bias: Annotated[
+        float,
+        typer.Option(min=0, help="σ of a constant error of each angle of the attitude, degrees"),
+    ] = 0.0,
+    attitude_drift: Annotated[
+        float,
+        typer.Option(
+            min=0, help="σ of an error of each angle that grows with time, degrees per second"
+        ),
+    ] = 0.0,
+    attitude_white: Annotated[
+        float,
+        typer.Option(min=0, help="σ of independent errors of the angles of every record, degrees"),
+    ] = 0.0,
+    position_bias: Annotated[
+        float,
+        typer.Option(
+            min=0, help="σ of a constant error of each coordinate of the position, metres"
+        ),
+    ] = 0.0,
+    position_drift: Annotated[
+        float,
+        typer.Option(
+            min=0, help="σ of an error of each coordinate that grows with time, metres per second"
+        ),
+    ] = 0.0,
+    position_white: Annotated[
+        float,
+        typer.Option(
+            min=0, help="σ of independent errors of the coordinates of every record, metres"
+        ),
+    ] = 0.0,
     draws: Annotated[
         int, typer.Option(min=0, help="Monte Carlo draws, in addition to propagation")
     ] = 0,

@@ -47,7 +47,11 @@ from jaxbundle.leastsquares.indexing.rows import (
 from jaxbundle.leastsquares.quality.distributions import level_of_one, normal_quantile
 from jaxbundle.leastsquares.quality.error_effects import AT_ONCE, effects, remove_fit, stack_rows
 from jaxbundle.leastsquares.quality.error_products import ErrorProducts, error_products
-from jaxbundle.leastsquares.quality.estimated_sizes import SizeEquations, widening
+from jaxbundle.leastsquares.quality.estimated_sizes import (
+    SizeEquations,
+    inverse_of_traces,
+    widening,
+)
 from jaxbundle.leastsquares.quality.size_traces import Traces
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.types import not_none
@@ -383,7 +387,7 @@ def fit_error_model(
             part = np.eye(len(theta))
             part[-1, 0] = -1.0
             forms = (part.T @ forms @ part)[:-1, :-1]
-    inverse = np.linalg.pinv(system.reduced[0], 1e-10, hermitian=True)
+    inverse = inverse_of_traces(system.reduced[0])
     covariance = inverse @ forms @ inverse
     if has_others:
         # θ of the given rows is σ0² − θ_0, so that their sum is σ0² whatever θ_0 is
