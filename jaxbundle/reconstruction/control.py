@@ -125,8 +125,9 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
                 f"{path}, line {number}: photograph {image!r} has no ending, such as .jpg; a name "
                 "with blanks needs tabs between the columns"
             )
-        # Without a name rows of one point are known by their equal coordinates, as text.
-        name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
+        # Without a name rows of one point are known by their equal coordinates, as text: the height
+        # tells apart points above each other on a façade.
+        name = "".join(cells[6:7]) or ",".join(cells[:3])
         records.append((name, (X, Y, Z), image, (u, v), MANUAL_SIGMA, number))
     return _collect(path, records, system, {})
 
@@ -181,16 +182,20 @@ def _read_table(
                     f"{path}, line {number}: {name} is {text!r}; expected a number"
                 ) from None
 
-        id, role = cells["id"].strip(), (cells.get("role") or "control").strip()
-        check_choice("role", role, ROLES, f"{path}, line {number}: ")
+        id, role = cells["id"].strip(), (cells.get("role") or "").strip()
+        if not id:
+            raise InputError(f"{path}, line {number}: the id is empty; expected that of a point")
+        if role:
+            check_choice("role", role, ROLES, f"{path}, line {number}: ")
         stated = [value(f"s{axis}") for axis in "xyz"]
         if any(s <= 0 for s in stated):
             raise InputError(f"{path}, line {number}: sX, sY, sZ must be positive, or empty")
         above, role_above = sigmas.get(id, (stated, role))
-        if role != role_above or any(a != s for a, s in zip(above, stated) if a > 0 and s > 0):
+        is_other_role = role and role_above and role != role_above
+        if is_other_role or any(a != s for a, s in zip(above, stated) if a > 0 and s > 0):
             raise InputError(f"{path}, line {number}: point {id} has another σ or role above")
-        # One row of a point may state its σ for all.
-        sigmas[id] = [s if s > 0 else a for a, s in zip(above, stated)], role
+        # One row of a point may state its σ and its role for all.
+        sigmas[id] = [s if s > 0 else a for a, s in zip(above, stated)], role or role_above
         X, uv = tuple(value(axis) for axis in "xyz"), (value("u"), value("v"))
         image, sigma = cells["image"].strip(), value("suv", MANUAL_SIGMA)
         records.append((id, X, image, uv, sigma, number))
@@ -206,10 +211,18 @@ def _collect(
     """The control of a file; `sigmas`: σ and role by point, where the file states them."""
     if not records:
         raise InputError(f"{path}: contains no control points")
-    position, numbers = {}, {}
-    for name, X, _, place, sigma, number in records:
-        if not np.isfinite([*X, *place, sigma]).all() or sigma <= 0:
+    position, numbers, measured = {}, {}, {}
+    for name, X, image, place, sigma, number in records:
+        if not np.isfinite([*X, *place]).all():
             raise InputError(f"{path}, line {number}: coordinates and pixels must be finite")
+        if not 0 < sigma < math.inf:
+            raise InputError(f"{path}, line {number}: suv must be positive, or empty")
+        above = measured.setdefault((image, name), number)
+        if above != number:
+            raise InputError(
+                f"{path}, line {number}: point {name} is measured in {image} in line {above}, too; "
+                "leave one of the two"
+            )
         # The table repeats the coordinates in each row of a point.
         if name in position and position[name] != X:
             raise InputError(f"{path}, line {number}: point {name} has other coordinates above")
@@ -218,7 +231,7 @@ def _collect(
     X, system_words = to_map(np.array(list(position.values())), system, str(path))
     # Control without a σ, NaN, gets one from --control-sigma or from its residuals.
     sigma = np.array([sigmas.get(n, ([math.nan] * 3, ""))[0] for n in position])
-    roles = tuple(sigmas.get(n, ((), "control"))[1] for n in position)
+    roles = tuple(sigmas.get(n, ((), ""))[1] or "control" for n in position)
     source = Source(str(path), np.array(list(numbers.values())), "line")
     return Control(
         Points(tuple(position), roles, X, sigma, source),

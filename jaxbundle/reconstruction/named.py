@@ -70,7 +70,8 @@ def find_named(
     if they are looked for; notes. `workers`: photographs in work at once, at most; default: one for
     each core.
 
-    **Raises:** `InputError` if control points are measured in unknown photographs only.
+    **Raises:** `InputError` if control points are measured in unknown photographs only, or where
+    their coded target is found, too.
     """
     image, name, xy, sigma, notes = [], [], [], [], []
     discs = None
@@ -81,14 +82,18 @@ def find_named(
         find = lambda photograph: _find_targets(photograph, targets, uncoded)
         of_photographs = map_in_threads(find, photographs, at_once)
         for k, points in enumerate(of_photographs):
-            if points is None:
+            if isinstance(points, str):
+                notes.append(f"{photographs[k].name}: no targets are looked for: {points}")
                 continue
             image += [k] * len(points)
             name += points.names
             xy += list(points.xy)
             sigma += list(points.sigma)
         left_out = Counter(
-            why for points in of_photographs if points is not None for _, why in points.left_out
+            why
+            for points in of_photographs
+            if not isinstance(points, str)
+            for _, why in points.left_out
         )
         notes += [
             f"{n} measurements of coded targets are left out: {why}" for why, n in left_out.items()
@@ -111,8 +116,15 @@ def find_named(
             )
         if unknown:
             notes.append(f"control measured in missing photographs: {list_some(unknown)}")
+        found = set(zip(image, name))
         for (file, id), place, s in zip(control.sightings, control.xy, control.sigma):
             if file in index:
+                if (index[file], id) in found:
+                    raise InputError(
+                        f"{control.points.source.name}: point {id} is measured in {file}, where "
+                        f"the coded target {id} is found, too: leave out the row, or give the "
+                        "point another id"
+                    )
                 image.append(index[file])
                 name.append(id)
                 xy.append(place)
@@ -170,12 +182,12 @@ def name_unused(
 
     **Raises:** `InputError` if no scale bar, or fewer than `min_control` control points, are left.
     """
-    photographs = {
+    photograph_count = {
         name: len(set(named_measurements.image[np.array(named_measurements.name) == name].tolist()))
         for name in set(named_measurements.name)
     }
     # An end in one photograph has no position, and a distance to it says nothing.
-    ends = lambda d: min(photographs.get(d["from"], 0), photographs.get(d["to"], 0))
+    ends = lambda d: min(photograph_count.get(d["from"], 0), photograph_count.get(d["to"], 0))
     unseen = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
     if distances and len(unseen) == len(distances):
         raise InputError(
@@ -186,10 +198,11 @@ def name_unused(
         unseen
     )
     if control is not None:
-        points = control.points
-        unseen = [id for id in points.id if id not in photographs]
+        # Tie points with coordinates are no control (`reconstruct`).
+        points = control.points.take(~control.points.has_role("tie"))
+        unseen = [id for id in points.id if id not in photograph_count]
         number = sum(
-            id in photographs and role != "check" for id, role in zip(points.id, points.role)
+            id in photograph_count and role != "check" for id, role in zip(points.id, points.role)
         )
         if number < min_control:
             raise InputError(
@@ -201,13 +214,12 @@ def name_unused(
     return notes
 
 
-def _find_targets(photograph: Photograph, kind: str, uncoded: bool) -> NamedPoints | None:
-    """The coded targets of a photograph; None if it cannot be read: it is left out later, with
-    the reason."""
+def _find_targets(photograph: Photograph, kind: str, uncoded: bool) -> NamedPoints | str:
+    """The coded targets of a photograph, or why it cannot be read."""
     try:
         grey = read_photograph(photograph.path)
-    except InputError:
-        return None
+    except InputError as error:
+        return str(error).removeprefix(f"{photograph.path}: ")
     with image_errors(photograph.path):
         return find_coded_targets(grey, kind, uncoded=uncoded)
 

@@ -10,9 +10,11 @@ import pytest
 from jaxbundle import read_network
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import select_checks
+from jaxbundle.measure.coded_targets import NamedPoints
 from jaxbundle.network.tables import LeftOut
 from jaxbundle.photographs.exif import GeographicPosition
 from jaxbundle.photographs.places import map_positions
+from jaxbundle.reconstruction import named
 from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
 from jaxbundle.reconstruction.controlled_network import says_left_out, without_names
 from jaxbundle.reconstruction.named import (
@@ -39,10 +41,27 @@ def test_gcp_list_of_opendronemap(tmp_path):
         "544256.7 5320919.9 5.0 1022.5 18 b.jpg gcp1 extra\n"
         "544157.7 5320899.2 5.5 4193 1552 a.jpg\n"
     )))  # fmt: skip
-    assert found.points.id == ("gcp1", "544157.7,5320899.2") and found.system == "EPSG:32633"
+    assert found.points.id == ("gcp1", "544157.7,5320899.2,5.5") and found.system == "EPSG:32633"
     assert found.sightings[:2] == (("a.jpg", "gcp1"), ("b.jpg", "gcp1"))
     np.testing.assert_allclose(found.xy[1], [1022.5, 18])
     assert np.isnan(found.points.sigma).all()
+
+
+def test_points_without_names_are_told_apart_by_their_coordinates(tmp_path):
+    """Also those above each other on a façade; an empty last column is no name."""
+    found = read_control_measurements(written(tmp_path, (
+        "EPSG:32633\n1\t2\t3\t4\t5\ta.jpg\t\n1\t2\t9\t4\t1\ta.jpg\t\n1\t2\t3\t4\t5\tb.jpg\t\n"
+    )))  # fmt: skip
+    assert found.points.id == ("1,2,3", "1,2,9")
+    assert [id for _, id in found.sightings] == ["1,2,3", "1,2,9", "1,2,3"]
+
+
+def test_one_row_states_the_role_of_a_point(tmp_path):
+    found = read_control_measurements(written(tmp_path, (
+        "id,X,Y,Z,role,image,u,v\nP,1,2,3,,a.jpg,1,2\nP,1,2,3,check,b.jpg,1,2\n"
+        "P,1,2,3,,c.jpg,1,2\nQ,4,2,3,,a.jpg,1,2\n"
+    )))  # fmt: skip
+    assert found.points.role == ("check", "control")
 
 
 def test_degrees_become_metres(tmp_path):
@@ -90,6 +109,12 @@ def test_tables_with_and_without_measurements(tmp_path):
     ("id,X,Y,Z,image,u,v\nP,1,2,x,a.jpg,1,2\n", "line 2: z is 'x'"),
     ("id,X,Y,Z,sX,image,u,v\nP,1,2,3,-1,a.jpg,1,2\n", "line 2: sX, sY, sZ must be positive"),
     ("id,X,Y,Z,sX,image,u,v\nP,1,2,3,1,a.jpg,1,2\nP,1,2,3,2,b.jpg,1,2\n", "P has another σ"),
+    ("id,X,Y,Z,role,image,u,v\nP,1,2,3,check,a.jpg,1,2\nP,1,2,3,fixed,b.jpg,1,2\n",
+     "P has another σ or role"),
+    ("id,X,Y,Z,suv,image,u,v\nP,1,2,3,0,a.jpg,1,2\n", "line 2: suv must be positive"),
+    ("id,X,Y,Z,image,u,v\n,1,2,3,a.jpg,1,2\n", "line 2: the id is empty"),
+    ("id,X,Y,Z,image,u,v\nP,1,2,3,a.jpg,1,2\nP,1,2,3,a.jpg,5,6\n",
+     "line 3: point P is measured in a.jpg in line 2, too"),
 ])  # fmt: skip
 def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
     with pytest.raises(InputError, match=said):
@@ -117,6 +142,10 @@ def test_scale_bars_and_control_that_no_photograph_shows(tmp_path):
     with pytest.raises(InputError, match="1 control points are measured .* 3 are needed.*7"):
         name_unused(both, control, [], 3)
     assert name_unused(both, control, [], 1) == ["control points in no photograph: 7"]
+    # coordinates of tie points are not used
+    ties = dataclasses.replace(control.points, role=("tie", "tie"))
+    with pytest.raises(InputError, match="0 control points are measured .* 1 are needed"):
+        name_unused(both, dataclasses.replace(control, points=ties), [], 1)
 
 
 def test_measurements_in_missing_photographs_are_reported(tmp_path):
@@ -127,6 +156,29 @@ def test_measurements_in_missing_photographs_are_reported(tmp_path):
     assert found.name == ("A",) and notes == ["control measured in missing photographs: 'b.jpg'"]
     with pytest.raises(InputError, match="measured in none of the photographs, but in a.jpg, b"):
         find_named([SimpleNamespace(name="c.jpg")], None, control)
+
+
+def test_a_point_measured_by_hand_where_its_target_is_found_is_refused(tmp_path, monkeypatch):
+    """Before features are matched. A photograph that cannot be read is named with the reason."""
+
+    def read(path):
+        if path.name == "b.jpg":
+            raise InputError(f"{path}: damaged")
+
+    target = NamedPoints(("45",), np.zeros((1, 2)), np.eye(2)[None])
+    monkeypatch.setattr(named, "read_photograph", read)
+    monkeypatch.setattr(named, "find_coded_targets", lambda *_, **options: target)
+    given = [
+        SimpleNamespace(name=name, path=tmp_path / name, size=(100, 100))
+        for name in ("a.jpg", "b.jpg")
+    ]
+    table = "id,X,Y,Z,image,u,v\n45,1,2,3,{},10,20\n"
+    control = read_control_measurements(written(tmp_path, table.format("b.jpg")))
+    found, _, notes = find_named(given, "ring14", control)
+    assert found.name == ("45", "45") and "b.jpg: no targets are looked for: damaged" in notes
+    control = read_control_measurements(written(tmp_path, table.format("a.jpg")))
+    with pytest.raises(InputError, match="control.txt: point 45 is measured in a.jpg, where"):
+        find_named(given, "ring14", control)
 
 
 TABLE = ("id,X,Y,Z,sX,sY,sZ,image,u,v\nA,1,2,3,,,,a.jpg,10,20\nB,4,2,3,0.01,0.01,0.02,a.jpg,11,2\n"
