@@ -57,9 +57,9 @@ class TrackMatchingSettings:
     explained. Smaller: windows at an occlusion match; larger: those with noise or reflections do
     not, and the positions of their features, several times less exact, take their place."""
     max_shift: float = 3.0
-    """Maximum distance of a match from its feature, pixels of its level: 2.5 σ of the difference of
-    two features of 7 pixels (`feature_sigma`). Larger: matches with the next period of
-    a texture."""
+    """Maximum distance of a match from where the features predict it, pixels of its level: 2.5 σ of
+    the difference of two features of 7 pixels (`feature_sigma`). Larger: matches with the next
+    period of a texture."""
     max_sigma: float = 0.4
     """Maximum σ of a match, pixels of its level: half of the σ of a feature of 7 pixels, 0.84
     (`feature_sigma`), whose position is taken instead above it."""
@@ -163,7 +163,7 @@ def measure_tracks(
 ) -> Measurements:
     """Measure all points of every track; each photograph is read once.
 
-    **Arguments:** `read(k)`: colours of a photograph; `advance`: called after each of them.
+    **Arguments:** `read_photograph(k)`: its colours; `advance`: called after each of them.
     """
     track_features = _place_windows(tracks, features, settings)
     cutouts = _cut_out(track_features, len(features), read_photograph, advance, settings)
@@ -173,6 +173,8 @@ def measure_tracks(
         ~track_features.is_template & is_inside & is_inside[track_features.template]
     )
     half_window = settings.window // 2
+    # (half_window·scale)²/longer pixels of the original (`second_order_sigma`), in those of the
+    # level.
     bend = (
         settings.second_order_sigma
         * half_window**2
@@ -394,7 +396,9 @@ def _collect(
     affine, covariance, rho, status = matches
     track, scale, corner = track_features.track, track_features.scale, track_features.corner
     place = affine[:, :, 2] + corner[to_match]
-    shift = np.linalg.norm(place - track_features.xy[to_match] / scale[to_match, None], axis=1)
+    # From where the features predict the point, the centre pixel of the window: it lies up to 0.7
+    # pixels beside the feature of the window.
+    shift = np.linalg.norm(affine[:, :, 2] - track_features.start[to_match, :, 2], axis=1)
     # Half of the variance of a match belongs to each of its two windows.
     sigma = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
     good = (status == int(MatchingStatus.CONVERGED)) & (rho > settings.min_correlation)

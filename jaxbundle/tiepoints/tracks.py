@@ -41,12 +41,19 @@ def make_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> list[lis
     if not rows:
         return []
     distance_ratio = np.concatenate([pair.distance_ratio for pair in pairs if len(pair)])
-    edges = merged[np.concatenate(rows)[np.argsort(distance_ratio, kind="stable")]]
+    matched = np.concatenate(rows)[np.argsort(distance_ratio, kind="stable")]
+    edges = merged[matched]
+    # Of several directions at one place the track has that of the most distinct match: least
+    # squares matching starts with it.
+    places, first_match = np.unique(edges, return_index=True)
+    feature_at = np.arange(first_number[-1])
+    feature_at[places] = matched.ravel()[first_match]
     members = _join(
         edges, np.searchsorted(first_number, np.arange(first_number[-1]), side="right") - 1
     )
     tracks = []
     for nodes in members:
+        nodes = feature_at[nodes]
         images = np.searchsorted(first_number, nodes, side="right") - 1
         tracks.append(sorted(zip(images.tolist(), (nodes - first_number[images]).tolist())))
     return tracks

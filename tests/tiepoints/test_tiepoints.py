@@ -436,6 +436,17 @@ def test_tracks_without_contradictions():
     ]  # fmt: skip
 
 
+def test_a_track_has_the_direction_that_was_matched():
+    """Of two at one place: the most distinct match says which, and another one joins as well."""
+    xy = [np.array([[10.0, 10.0], [10.0, 10.0], [90.0, 50.0]]) for _ in range(3)]
+    pairs = [
+        paired(0, 1, [[0, 0], [2, 2]], [0.5, 0.3]),
+        paired(1, 2, [[1, 1], [2, 2]], [0.2, 0.3]),
+    ]
+    tracks = sorted(make_tracks([features_at(of_image) for of_image in xy], pairs))
+    assert tracks == [[(0, 0), (1, 1), (2, 1)], [(0, 2), (1, 2), (2, 2)]]
+
+
 def test_chosen_tracks_cover_the_photographs():
     rng = np.random.default_rng(0)
     dense = rng.uniform(0, 200, (3000, 2))

@@ -103,6 +103,20 @@ def test_sigma_has_a_floor_in_quadrature(scene):
     assert (default.sigma >= 0.01 * scale).all() and (without.sigma < 0.02).any()
 
 
+@pytest.mark.parametrize(("away", "good"), [(2.99, True), (3.01, False)])
+def test_matches_are_compared_with_where_the_features_predict_them(scene, monkeypatch, away, good):
+    """The point is the middle of a pixel, up to 0.7 pixels from the feature of the window, and as
+    far, turned and scaled, from that of the other photograph: this is no error of a match."""
+    move = away * np.array([0.6, -0.8])
+    found = lambda windows, pieces, others, start, *_: (
+        start + np.concatenate([np.zeros((2, 2)), move[:, None]], 1),
+        np.zeros((len(others), 2, 2)), np.ones(len(others)), np.zeros(len(others), int),
+    )  # fmt: skip
+    monkeypatch.setattr(track_measurement, "_match_in_chunks", found)
+    measured = measure(scene, max_shift=3.0)
+    assert ((measured.level >= 0) == good).all()
+
+
 @pytest.mark.parametrize(("window", "search_window"), [(17, 41), (25, 41), (17, 61)])
 def test_features_are_matched_where_the_window_fits_into_the_photograph(
     window, search_window, monkeypatch
