@@ -22,7 +22,8 @@ from jaxbundle.choices import ESTIMATORS, METHODS
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.datum.motions import likely_motions
-from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table
+from jaxbundle.leastsquares.declarations import Motions, ObservationSet, Table, row_numbers
+from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
@@ -71,7 +72,11 @@ class Result:
 
     `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `counts` (observations, unknowns,
     datum, redundancy); `result[table]`; `residuals(kind)`; `covariance(function)`; `removed`,
-    `suspects`, `components`; `undetermined`, names of undetermined unknowns.
+    `suspects`, `components`; `undetermined`, names of undetermined unknowns; `unsettled`, what of
+    robust weights and variance components was still changing when its rounds ended.
+
+    Statistics of problems too large for a factor raise an `InputError`; `minimum.values` has the
+    tables.
     """
 
     def __init__(
@@ -81,10 +86,11 @@ class Result:
         removed: Sequence[RemovedRow] = (),
         suspects: Sequence[SuspectRow] = (),
         factors: Mapping[str, float] | None = None,
+        unsettled: Sequence[str] = (),
     ):
         self.problem, self.minimum = problem, minimum
         self.removed, self.suspects = tuple(removed), tuple(suspects)
-        self.sigma_factors = dict(factors or {})
+        self.sigma_factors, self.unsettled = dict(factors or {}), tuple(unsettled)
 
     @property
     def termination(self) -> str:
@@ -124,6 +130,21 @@ class Result:
             raise NotSolvedError(self._failure, list(self.undetermined))
         return self._solution
 
+    @property
+    def _factored(self) -> Solution:
+        """The solution with a factor to read covariances from."""
+        solution = self.solution
+        if not self._has_factor:
+            raise InputError(
+                "the problem is too large for its statistics: use a part of it; the adjusted "
+                "tables are in `minimum.values`"
+            )
+        return solution
+
+    @property
+    def _has_factor(self) -> bool:
+        return self.problem.plan.reduction in FACTORS
+
     @functools.cached_property
     def _failure(self) -> str:
         """Why there is no solution: the undetermined unknowns, or observations without
@@ -155,7 +176,7 @@ class Result:
     def __getitem__(self, table: str) -> TableResult:
         if table not in self.minimum.values:
             raise KeyError(f"there is no table {table!r}; known: {', '.join(self.minimum.values)}")
-        return table_result(self.solution, table, self.sigma0)
+        return table_result(self._factored, table, self.sigma0)
 
     def redundancy(self, kind: str) -> Float[np.ndarray, "n *r"]:
         """The redundancy numbers of the observations of a kind, in the given order."""
@@ -178,7 +199,7 @@ class Result:
         return {c: x[:, 0] if is_single else x for c, x in columns.items()}
 
     def _residuals(self, o: str) -> dict[str, Float[AnyArray, "n r"]]:
-        reliability, weight = self.solution.reliability, self.problem.weights(o)
+        reliability, weight = self._factored.reliability, self.problem.weights(o)
         has_weight = weight > 0
         # The inner `where` keeps 1/0 out of the unused branch.
         sigma = np.where(has_weight, 1 / np.where(has_weight, weight, 1.0), np.inf)
@@ -197,7 +218,8 @@ class Result:
     @functools.cached_property
     def components(self) -> dict[str, Component]:
         """Variance components of the kinds of observations."""
-        return variance_components(self.solution, kinds_as_groups(self.problem), self.sigma_factors)
+        groups = kinds_as_groups(self.problem)
+        return variance_components(self._factored, groups, self.sigma_factors)
 
     def covariance(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The covariance of any differentiable function of the tables (name → values) → [n]."""
@@ -211,8 +233,12 @@ class Result:
             f"solved in {self.iterations} iterations: {self.termination}",
             f"{n.observations} observations, {n.unknowns} unknowns, datum defect {n.datum}, "
             f"redundancy {n.redundancy}, sigma0 {self.sigma0:.4g}",
-            f"{'kind':32}{'number':>8}{'redundancy':>12}{'sigma/given':>17}",
         ]
+        if self.unsettled:
+            lines.append(f"not settled: {', '.join(self.unsettled)}")
+        if not self._has_factor:
+            return "\n".join([*lines, "too large for statistics"])
+        lines.append(f"{'kind':32}{'number':>8}{'redundancy':>12}{'sigma/given':>17}")
         lines += [
             f"{name:32}{c.observations:8d}{c.redundancy:12.2f}{c.sigma:17.4g}"
             for name, c in self.components.items()
@@ -267,6 +293,7 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     one_of("robust", robust, ESTIMATORS, allow_none=True)
     truth("estimate_components", estimate_components)
     check_test(snooping, significance)
+    # One more: the first evaluation is of the start values.
     steps = integer("max_iterations", max_iterations) + 1
     if robust and snooping:
         raise InputError("robust estimation or data snooping, not both at once")
@@ -305,20 +332,29 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     solution, removed, suspects, factors = minimise_again(problem, problem.data.start), [], [], {}
     # Iterations may have gone without a factor; statistics need one.
     problem = with_factor(problem)
+    solution = Solution(problem, solution.values)
     unweighted = Result(problem, minima[-1])
     if not (unweighted.converged and (robust or snooping or estimate_components)):
         return unweighted
+    if (snooping or estimate_components) and problem.plan.reduction not in FACTORS:
+        raise InputError(
+            "data snooping and variance components need redundancy numbers, and the problem is too "
+            "large for them: use a part of it, or robust estimation"
+        )
+    unsettled: list[str] = []
     if robust:
         reweighted = reweight(problem, solution.values, minimise_again, robust)
         solution, suspects = reweighted.solution, reweighted.suspects(significance)
+        unsettled += [] if reweighted.converged else ["robust weights"]
     if snooping:
-        solution = Solution(problem, solution.values)
         solution, removed = snoop(
             solution, minimise_again, test=snooping, significance=significance
         )
     if estimate_components:
-        solution, factors, _ = estimate(solution, kinds_as_groups(problem), minimise_again)
-    return Result(solution.problem, minima[-1], removed, suspects, factors)
+        groups = kinds_as_groups(problem)
+        solution, factors, changing = estimate(solution, groups, minimise_again)
+        unsettled += [f"variance component of {name}" for name in changing]
+    return Result(solution.problem, minima[-1], removed, suspects, factors, unsettled)
 
 
 def kinds_as_groups(problem: Problem) -> list[VarianceGroup]:
@@ -377,6 +413,14 @@ def _hold_datum(
     for name, rows in datum.items():
         if name not in all_unknowns:
             raise InputError(f"datum: there is no table {name!r}; known: {', '.join(all_unknowns)}")
+        table = next(t for t in tables if t.name == name)
+        is_mask = np.asarray(rows).dtype == bool and np.shape(rows) == (table.rows,)
+        rows = np.flatnonzero(rows) if is_mask else row_numbers("datum", rows)
+        rows = table.rows_of(rows, "datum") if rows.dtype == object else rows
+        if not len(rows):
+            raise InputError(f"datum: no row of table {name!r} is given")
+        for row in rows[(rows < 0) | (rows >= table.rows)][:1]:
+            raise InputError(f"datum: there is no row {row} of table {name!r}: it has {table.rows}")
         datum_unknowns[name] = np.zeros(all_unknowns[name].shape)
-        datum_unknowns[name][np.asarray(rows)] = 1.0
+        datum_unknowns[name][rows] = 1.0
     return datum_unknowns, False

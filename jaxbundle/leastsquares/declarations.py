@@ -8,6 +8,7 @@ A problem without photographs:
 """
 
 import dataclasses
+import numbers
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -84,7 +85,26 @@ class Table:
                 f"table {self.name!r}: expected one unit, or {self.space.width}; got "
                 f"{len(self.units)} of them"
             )
+        self._check_names()
         object.__setattr__(self, "title", self.title or self.name)
+
+    def _check_names(self) -> None:
+        """Refuse labels and parameters that do not name every row and direction, each its own."""
+        if self.labels is not None:
+            if len(self.labels) != self.rows:
+                raise InputError(
+                    f"table {self.name!r}: expected {self.rows} labels, got {len(self.labels)}"
+                )
+            seen: set[str] = set()
+            for row in range(self.rows):
+                if (label := self.label(row)) in seen:
+                    raise InputError(f"table {self.name!r}: two rows have the label {label!r}")
+                seen.add(label)
+        if self.parameters and len(self.parameters) != self.space.width:
+            raise InputError(
+                f"table {self.name!r}: expected {self.space.width} parameters, got "
+                f"{len(self.parameters)}"
+            )
 
     @property
     def vector(self) -> Vector:
@@ -115,7 +135,7 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class Local:
-    """Few of many columns that an observation depends on (`leastsquares.local`).
+    """Few of many columns that an observation depends on (`equations/local.py`).
 
     `slot`: of the kind's `of`, a table of vectors; `number` of columns; `columns`:
     `(blocks…, measured) -> tuple of whole numbers`, which elements of the vector they are;
@@ -217,7 +237,7 @@ class ObservationSet:
     def __post_init__(self):
         name, kind = self.kind.name, self.kind
         object.__setattr__(self, "name", self.name or name)
-        rows = tuple(_row_numbers(name, r) for r in self.rows)
+        rows = tuple(row_numbers(name, r) for r in self.rows)
         if len(rows) != len(kind.of):
             raise InputError(
                 f"{name}: expected rows of {len(kind.of)} tables ({', '.join(kind.of)}), not "
@@ -292,9 +312,14 @@ def _arrays(description: str, tree: PyTree) -> PyTree[np.ndarray]:
     return jax.tree.map(number, tree, is_leaf=lambda x: isinstance(x, list))
 
 
-def _row_numbers(kind: str, rows: Sequence | np.ndarray) -> np.ndarray:
+def row_numbers(kind: str, rows: Sequence | np.ndarray) -> np.ndarray:
     """Whole numbers, or labels as objects."""
-    if np.asarray(rows).dtype.kind in "OUS":
+    column = np.asarray(rows)
+    # pandas has whole numbers in columns of objects.
+    is_whole = lambda x: isinstance(x, numbers.Integral) and not isinstance(x, bool)
+    if column.dtype.kind == "O" and column.size and all(map(is_whole, column.ravel())):
+        return column.ravel().astype(np.int64)
+    if column.dtype.kind in "OUS":
         return np.array([str(r) for r in np.ravel(rows)], dtype=object)
     rows = numeric_array(f"{kind}: rows", rows, "row numbers or labels").ravel()
     bad = rows != np.round(rows)
@@ -311,6 +336,12 @@ def _whitening(
         raise InputError(
             f"{name}: covariance must be {[number, residuals, residuals]}, not "
             f"{list(covariance.shape)}"
+        )
+    variance = np.einsum("nii->ni", covariance)
+    for row, i in np.argwhere(variance <= 0)[:1].tolist():
+        raise InputError(
+            f"{name}: the covariance of observation {row + 1} is not positive definite: it has a "
+            f"variance of {variance[row, i]:g}"
         )
     size = np.sqrt(np.einsum("nii,njj->nij", covariance, covariance))
     # 1e-9: rounding of a covariance that was computed, or printed with nine digits; Cholesky reads

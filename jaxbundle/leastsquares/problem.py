@@ -314,7 +314,8 @@ def count(tables: Sequence[Table], data: Data) -> SystemCounts:
 
 
 def check(tables: Sequence[Table], observations: Sequence[ObservationSet]) -> None:
-    """Refuse duplicate table names, unknown tables, and rows that do not exist."""
+    """Refuse duplicate table names, and rows that do not exist; `resolve_labels` has refused
+    unknown tables."""
     table_of = {}
     for table in tables:
         if table.name in table_of:

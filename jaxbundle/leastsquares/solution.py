@@ -97,13 +97,16 @@ def find_minimum(
         if moved_problem is problem or not bool(converged(minimum.termination)):
             break
         # Open combinations need not form a group (one open height of a point, say): the motion to
-        # the datum may have left the minimum. 1e-12: of the digits that vᵀPv has after rounding.
+        # the datum may have left the minimum. 1e-12: of the digits that vᵀPv has after rounding;
+        # added for exact data, whose vᵀPv is rounding alone: a change of 1e-12 is one of 1e-6 σ.
         cost_before, cost_after = (
             Solution(problem, without_filling(problem, v)).vtpv for v in (minimum.values, values)
         )
         if cost_after <= cost_before * (1 + 1e-12) + 1e-12:
             break
         minimum = minimise_from(values)
+    else:
+        values = minimum.values
     values = without_filling(problem, values)
     return dataclasses.replace(undisplaced, termination=minimum.termination, values=values)
 
@@ -142,6 +145,7 @@ def _worth_sharing(problem: Problem, start: Values) -> bool:
         return False
     if sum(o.number for o in problem.observations) < MIN_SHARED_OBSERVATIONS:
         return False
+    # Devices that end at different steps would wait for each other forever.
     return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(start))
 
 

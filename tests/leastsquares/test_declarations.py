@@ -35,7 +35,9 @@ def adjusted(start=START, rows=ENDS, rise=RISE, free=(False, True, True), labels
     (dict(sigma=np.ma.array([0.1] * 3, mask=[1, 0, 0])), "sigma of observation 1 is nan"),
     (dict(sigma=[0.1, 0.1]), "sigma must be one number"),
     (dict(covariance=np.eye(3)), r"covariance must be \[3, 1, 1\]"),
-    (dict(covariance=-np.ones((3, 1, 1))), "not positive definite"),
+    (dict(covariance=-np.ones((3, 1, 1))), "observation 1 is not positive definite: .* of -1"),
+    (dict(rows=([0, 1, 0], [1, 2, 2]), labels="AB"), "expected 3 labels, got 2"),
+    (dict(rows=([0, 1, 0], [1, 2, 2]), labels="ABA"), "two rows have the label 'A'"),
     (dict(covariance=np.full((3, 1, 1), np.nan)), "not symmetric or not finite"),
 ])  # fmt: skip
 def test_refused(given, words):
@@ -47,6 +49,30 @@ def test_an_observation_of_a_table_that_is_not_there():
     between = ls.Kind("difference", lambda a, b, dh: b - a - dh, of=("height", "heights"))
     with pytest.raises(InputError, match="difference: there is no table 'heights'; known: height"):
         ls.adjust([ls.Table("height", START)], [between(ENDS, RISE)])
+
+
+@pytest.mark.parametrize("rows, words", [
+    ([], "no row of table 'height' is given"),
+    ([3], "no row 3 of table 'height': it has 3"),
+    ([-1], "no row -1"),
+    (["C", "D"], "there is no height 'D'"),
+])  # fmt: skip
+def test_datum_rows_that_are_not_there_are_refused(rows, words):
+    table = ls.Table("height", START, labels="ABC")
+    with pytest.raises(InputError, match=words):
+        ls.adjust([table], [LEVELLED(ENDS, RISE)], datum={"height": rows})
+
+
+def test_datum_rows_are_numbers_labels_or_a_mask():
+    table, mean = ls.Table("height", START, labels="ABC"), START[[0, 2]].mean()
+    for rows in ([0, 2], ["A", "C"], np.array([True, False, True])):
+        found = ls.adjust([table], [LEVELLED(ENDS, RISE)], datum={"height": rows})["height"].value
+        assert found[[0, 2]].mean() == pytest.approx(mean, abs=1e-12)
+
+
+def test_whole_numbers_of_a_data_frame_are_rows_and_not_labels():
+    columns = [np.array(rows, dtype=object) for rows in ENDS]
+    np.testing.assert_array_equal(adjusted(rows=columns), adjusted())
 
 
 def test_lists_labels_and_what_is_left_out():

@@ -7,6 +7,9 @@ from jaxbundle import leastsquares as ls
 from jaxbundle.leastsquares.quality.sensitivity import pull_back
 
 LEVELLED = ls.Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
+SCALED = ls.Kind(
+    "levelled with a rod", lambda a, b, read: b - a - read[0] * read[1], of=("height", "height")
+)
 EQUAL = ls.Kind("equal heights", lambda a, b, _: b - a, of=("height", "height"))
 
 
@@ -30,3 +33,15 @@ def test_heights_follow_differences_and_conditions(covariance):
     expected = f[:, 1:, 0] @ np.linalg.inv(A.T @ A) @ A.T
     np.testing.assert_allclose(found["levelled difference"][..., 0], expected[:, :15], atol=1e-9)
     np.testing.assert_allclose(found["equal heights"][..., 0], expected[:, 15:], atol=1e-9)
+
+
+def test_of_several_measured_arrays_the_residual_is_changed():
+    """A difference is a reading times the scale of its rod: neither alone has the σ."""
+    i, j = np.triu_indices(4, 1)
+    reading, scale, sigma = np.arange(6.0), np.full(6, 1.01), np.full(6, 0.3)
+    tables = [ls.Table("height", np.zeros(4), free=np.arange(4) > 0)]
+    f = np.random.default_rng(1).normal(size=(1, 4, 1))
+    of = lambda *sets: pull_back(ls.adjust(tables, [*sets]).solution, {"height": f})
+    found = of(SCALED((i, j), (reading, scale), sigma=sigma))["levelled with a rod"]
+    expected = of(LEVELLED((i, j), reading * scale, sigma=sigma))["levelled difference"]
+    np.testing.assert_allclose(found, expected, atol=1e-9)

@@ -85,8 +85,13 @@ def regularise_diagonal(normal: Normal, ridge: float = 1e-10) -> Normal:
     1e5 times their σ with all others given: far beyond all that is judged weak. An unknown with
     a σ below 1e-3 of this keeps it to 1e-6; half or double the ridge change no verdict."""
     N, e = normal.blocks, normal.plan.eliminated
-    diagonal_of = lambda B: jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
-    add = lambda B: B + ridge * diagonal_of(B)
+
+    def add(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
+        diagonal = jnp.diagonal(B, axis1=1, axis2=2)
+        # Of an unknown without observations the diagonal is zero, and so are its row and column.
+        ridge_of_rows = jnp.where(diagonal > 0, ridge * diagonal, 1.0)
+        return B + ridge_of_rows[:, :, None] * jnp.eye(B.shape[1])
+
     diagonal = {name: add(B) for name, B in N.diagonal_blocks.items()}
     eliminated = None if e is None else add(N.eliminated)
     return Normal(

@@ -67,8 +67,8 @@ class ConjugateGradients(eqx.Module):
         def improved(
             y: Tangent, residual: Tangent, tolerance: float, steps: int
         ) -> tuple[Tangent, Tangent]:
-            """y refined with the residual `residual`, if that decreases it; and the new "
-            "residual."""
+            """y refined with the residual `residual`, if that decreases it; and the new
+            residual."""
             # Lineax annotates a float, but accepts an array. 1e-300: a right-hand side of zeros
             # has its solution at once, instead of 0/0.
             limit: Any = jnp.maximum(tolerance * optx.two_norm(residual), 1e-300)

@@ -93,6 +93,8 @@ def minimise(
 
     def tolerance(equations: tuple) -> Tolerance:
         # The last step moves no unknown by more than 1e-8 of its σ; `finish` takes one more.
+        # tr N for Σ(l/σ)², which is not known here: the squares by which unknowns change v that
+        # change by 1, alike where unknowns and measured values are of the order of 1.
         N, _, rows = equations
         zero = jnp.zeros((), N.dtype)
         return Tolerance(rows - unknowns + zero, jnp.trace(N), zero + 1e-8, zero)
@@ -121,6 +123,7 @@ def finish(
     step = jnp.where(determined, -_solve(N, g), 0)
     square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)
     # At the minimum, rounding may let vᵀv rise; far from it, an undamped step may be wrong.
+    # (1e-11)²·tr N: where v vanishes, what unknowns that change by 1e-11 each leave of it.
     rounding = 1e-22 * jnp.sum(diagonal)
     good = square(retract(x, step), constant_data) <= 1.001 * square(x, constant_data) + rounding
     x = retract(x, jnp.where(good, step, 0))

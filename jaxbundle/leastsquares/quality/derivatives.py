@@ -138,7 +138,7 @@ class LinearisedSolution(eqx.Module):
     def times(self, change: Tangent) -> Tangent:
         """H·δ of ½vᵀPv and of the penalty on the pins, from `terms`."""
         product = multiply(self.declared, self.plan, self.values, not_none(self.terms), change)
-        penalty = {g: pins**2 * change[g] for g, pins in self.pins.items()}
+        penalty = {g: pins * change[g] for g, pins in self.pins.items()}
         return {g: x + penalty[g] if g in penalty else x for g, x in product.items()}
 
     def move(self, change: Tangent, data: Data) -> Values:

@@ -31,7 +31,8 @@ def skewed_quantile(probability: float, skewness: float) -> float:
     their first three moments (Pearson 1959; Imhof 1961)."""
     if skewness < 0:
         return -skewed_quantile(1 - probability, -skewness)
-    # χ² of ν has the skewness √(8/ν); of more degrees of freedom it is normal to 1e-6
+    # χ² of ν has the skewness √(8/ν). A smaller one moves quantiles up to 3.7 by less than 3e-5,
+    # (z² − 1)/6 times the skewness (Cornish and Fisher).
     if skewness < 1e-5:
         return normal_quantile(probability)
     shape = 4 / skewness**2

@@ -249,9 +249,9 @@ class ErrorModel:
         names = [(INDEPENDENT, "σ"), *((c.name, c.unit) for c in self.components)]
         names = [key for key in names if key[0] != OTHERS]
         # σ of √θ: σ_θ/(2√θ), but at most √σ_θ, its value at θ = 0
-        theta, variance_of_theta = (x[: len(names)] for x in (self.theta, self.theta_sigma))
-        root, largest_sigma = np.sqrt(theta), np.sqrt(variance_of_theta)
-        sigma = np.minimum(variance_of_theta, 2 * root * largest_sigma) / np.where(
+        theta, sigma_of_theta = (x[: len(names)] for x in (self.theta, self.theta_sigma))
+        root, largest_sigma = np.sqrt(theta), np.sqrt(sigma_of_theta)
+        sigma = np.minimum(sigma_of_theta, 2 * root * largest_sigma) / np.where(
             root > 0, 2 * root, 1.0
         )
         sigma = np.where(root > 0, sigma, largest_sigma)
@@ -435,7 +435,7 @@ def stated_error_model(
         for t, component in zip(theta[1:], components):
             blocks: dict[str, np.ndarray] = {}
             root = component.sparse_root()
-            for columns in _columns(root, settings, rng) if t > 0 else ():
+            for columns in _columns(root, settings, rng) if t != 0 else ():
                 _add_squares(blocks, remove_fit(solution, columns)[1])
             blocks_by_theta.append(blocks)
     zeros = np.zeros(len(theta))

@@ -19,8 +19,9 @@ powers of M·V follow from det(1 − z·M·V) = det(1 − z·P·V)·det(1 + Σ z
     tr((MV)³)  = l_3 − 3·tr a_3 + 3·tr(a_1·a_2) − tr a_1³
     tr((MV)⁴)  = l_4 − 4·tr a_4 + 4·tr(a_1·a_3) + 2·tr a_2² − 4·tr(a_1²·a_2) + tr a_1⁴
 
-l_n, a_1, a_2 and tr(F̃ᵀVF̃) are exact. What only the skewness and the uncertainty of sizes need, a_3,
-a_4 and F̃ᵀV(MV)ⁿF̃ in full, is from some of the clusters where there are many.
+l_n, a_1, a_2 and, of roots with few values in a row, tr(F̃ᵀVF̃) are exact. That of the others, and
+what only the skewness and the uncertainty of sizes need, a_3, a_4 and F̃ᵀV(MV)ⁿF̃ in full, is from
+some of the clusters where there are many.
 """
 
 import dataclasses
@@ -167,17 +168,17 @@ def share_of_many(
     V is nearly a multiple of 1, as of errors along tracks: only the difference is from some of
     them."""
     w = len(FF)
-    part, of_white, like, white = np.zeros(w), np.zeros(w), 0.0, 0.0
+    part, of_white, trace, number = np.zeros(w), np.zeros(w), 0.0, 0
     for c in _chosen_portions(clusters, is_chosen, w):
         W = c.without_fit(roots.mix(roots.wide_rows(c.rows)))
         V = not_none(c.V)
         part += np.sum(V @ W * W, (0, 1))
         of_white += np.sum(W * W, (0, 1))
-        like += np.trace(V, axis1=1, axis2=2).sum()
-        white += V.shape[0] * V.shape[1]
+        trace += np.trace(V, axis1=1, axis2=2).sum()
+        number += V.shape[0] * V.shape[1]
     # V = f·1 + (V − f·1), f its mean: the first part gives f·diag(FᵀPF), which is known exactly;
     # the second is small, and its error with it.
-    factor = like / max(white, 1.0)
+    factor = trace / max(number, 1)
     share = len(is_chosen) / max(is_chosen.sum(), 1)
     return factor * np.diag(FF) + share * (part - factor * of_white)
 
@@ -349,11 +350,11 @@ class ErrorProducts:
         # skewness and the uncertainty of sizes need.
         number = sum(len(c.rows) for c in self.clusters)
         order, n = rng.permutation(number), self.roots.narrow.shape[1]
-        is_chosen, near = np.zeros(number, bool), np.zeros(number, bool)
-        is_chosen[order[:at_most]] = near[order[: 10 * at_most]] = True
-        exact = share_of_many(self.clusters, self.roots, s.FF[n:, n:], near)
-        exact = np.concatenate([s.FVF, exact]) - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
-        exact = exact + np.sum(self.Y * (a1 @ self.Y), 0)
+        is_chosen, of_diagonal = np.zeros(number, bool), np.zeros(number, bool)
+        is_chosen[order[:at_most]] = of_diagonal[order[: 10 * at_most]] = True
+        diagonal = share_of_many(self.clusters, self.roots, s.FF[n:, n:], of_diagonal)
+        diagonal = np.concatenate([s.FVF, diagonal]) - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
+        diagonal = diagonal + np.sum(self.Y * (a1 @ self.Y), 0)
         # The identities of the module; none of these matrices is larger than kept unknowns.
         l = s.powers
         trace = np.trace
@@ -365,7 +366,7 @@ class ErrorProducts:
         )
         # Errors along a track are nearly independent ones, V ≈ f·1 with F̃ᵀVF̃ ≈ f·S: only the
         # difference is from some clusters.
-        like = t1 / max(self.solution.problem.counts.redundancy, 1)
+        factor = t1 / max(self.solution.problem.counts.redundancy, 1)
         for c in _chosen_portions(self.clusters, is_chosen, p + q):
             x0 = np.concatenate(self._dense(c), 2)
             V = not_none(c.V)
@@ -376,7 +377,7 @@ class ErrorProducts:
             x3 = V @ x2
             x4 = _tall(c.without_fit(x3))
             x0, x1, x2, x3 = map(_tall, (x0, x1, x2, x3))
-            near += x0[:, p:].T @ (x1 - like * x0)[:, p:]
+            near += x0[:, p:].T @ (x1 - factor * x0)[:, p:]
             u2, f2 = x2[:, :p], x2[:, p:]
             b2 += u2.T @ f2
             a3 += u2.T @ x3[:, :p]
@@ -386,7 +387,7 @@ class ErrorProducts:
         share = number / max(is_chosen.sum(), 1)
         a3, a4, b2, near, R2, R3 = (share * x for x in (a3, a4, b2, near, R2, R3))
         # From powers of P·V between F̃ to those of M·V: what the kept unknowns take is subtracted.
-        R1 = like * self.few + near
+        R1 = factor * self.few + near
         R2 = R2 - b1.T @ b1
         cross = b1.T @ b2
         R3 = R3 - cross - cross.T + b1.T @ a1 @ b1
@@ -394,7 +395,7 @@ class ErrorProducts:
         square = a1 @ a1
         t4 = l[3] - 4 * trace(a4) + 4 * np.sum(a1 * a3) + 2 * np.sum(a2 * a2)
         t4 = t4 - 4 * np.sum(square * a2) + np.sum(square * square)
-        return Powers(np.array([t1, t2, t3, t4]), exact, R1, R2, R3)
+        return Powers(np.array([t1, t2, t3, t4]), diagonal, R1, R2, R3)
 
     def _dense(self, c: Clusters) -> tuple[Batch, Batch]:
         """U and F̃ of some clusters."""

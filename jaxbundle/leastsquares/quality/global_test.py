@@ -38,7 +38,7 @@ def chi_squared_test(
     vtpv: float, redundancy: int, origin: str = STATED, significance: float = LEVEL
 ) -> dict:
     """χ² test of vᵀPv against a variance factor of 1, two-sided: `vtpv`; `low`, `high`, the
-    interval; `has_passed`, None if nothing is tested; `sigma_origin`."""
+    interval; `passed`, None if nothing is tested; `sigma_origin`."""
     low = high = has_passed = None
     if redundancy > 0:
         ends = significance / 2, 1 - significance / 2

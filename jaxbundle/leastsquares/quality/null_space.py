@@ -37,6 +37,7 @@ def undetermined_unknowns(
         # A one along every open motion: singular only in what the observations should determine.
         S = S + q @ q.T
     eigenvalues, vectors = np.linalg.eigh(S) if S.size else (np.zeros(0), S)
+    # Rounding is a fraction of the largest eigenvalue (the sum of the last one: 0 without any).
     null = vectors[:, eigenvalues < threshold * max(1.0, eigenvalues[-1:].sum())]
     # Squared components: the part of each unknown in the null space, whatever basis eigh chose.
     share, names = (null**2).sum(1), kept_unknowns(problem)

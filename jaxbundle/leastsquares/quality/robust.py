@@ -127,11 +127,11 @@ def robust_scale(problem: Problem, lengths: dict[str, Float[np.ndarray, " n"]]) 
     """s of residual lengths |v/σ| of observations, by set; never 0."""
     normal = []  # |v/σ| by the median of the lengths of as many normal residuals
     for o, t in lengths.items():
-        weight = problem.weights(o)
-        has_weight = (weight > 0).any(1)
+        residuals_each = (problem.weights(o) > 0).sum(1)
         # Lengths of one, two or three residuals have different medians, √χ²₀.₅(k): divided by them
         # they are comparable.
-        normal.append(t[has_weight] / math.sqrt(chi2_quantile(0.5, weight.shape[1])))
+        for k in np.unique(residuals_each[residuals_each > 0]).tolist():
+            normal.append(t[residuals_each == k] / math.sqrt(chi2_quantile(0.5, k)))
     counts = problem.counts
     share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
     # 1e-3: with a thousand unknowns for one redundant observation the scale is no estimate.

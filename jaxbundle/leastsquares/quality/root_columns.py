@@ -154,7 +154,8 @@ def gram(F: Any) -> Matrix:
     count = np.diff(F.indptr)
     rows = np.flatnonzero(count)
     # Rows with values in the same columns have equal sums of the columns' random numbers; that
-    # others have the same sum has a probability of 2⁻⁴⁰ a pair.
+    # others have the same sum has a probability of 2⁻⁴⁰ a pair. They list their columns in the same
+    # order, which is that of the first one below.
     key = np.random.default_rng(0).integers(1, 1 << 40, F.shape[1])[F.indices]
     pattern = np.add.reduceat(key, F.indptr[rows]) if len(rows) else rows
     order = np.argsort(pattern, kind="stable")

@@ -71,8 +71,9 @@ def pull_back(
     """The change of linear functions of the changes of tables by one σ (a priori) of every
     observation, by set.
 
-    An observation with a covariance changes by a column of its root L. If the measurement does not
-    have one number per residual, the residual is changed by −1, as by a measurement larger by σ.
+    An observation with a covariance changes by a column of its root L. If the measurement is not
+    one array with a number per residual, the residual is changed by −1, as by a measurement larger
+    by σ.
 
     **Raises:** `NotSolvedError` if the values are not a minimum."""
     declared, plan, values, data = solution.arguments
@@ -98,8 +99,9 @@ def pull_back(
         of_residuals = np.concatenate([np.asarray(by[o]) for _, by, _ in pulled])
         weight, n = np.asarray(problem.data.weight[o]), observation_set.number
         effects[o] = of_residuals[:, :n]
-        leaves = [jax.tree.leaves(slopes[o])[:1] for slopes, *_ in pulled]
-        if weight.ndim == 2 and leaves[0] and leaves[0][0].size == of_residuals[0].size:
+        leaves = [jax.tree.leaves(slopes[o]) for slopes, *_ in pulled]
+        is_one = len(leaves[0]) == 1 and leaves[0][0].size == of_residuals[0].size
+        if weight.ndim == 2 and is_one:
             slope = np.concatenate([np.asarray(leaf) for (leaf,) in leaves])[:, :n]
             sigma = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
             effects[o] = slope.reshape(number, n, -1) * sigma

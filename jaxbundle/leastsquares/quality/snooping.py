@@ -34,6 +34,7 @@ from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.quality.distributions import critical_w, normal_quantile
 from jaxbundle.leastsquares.quality.names import eliminated_rows
 from jaxbundle.leastsquares.quality.separability import choose_together, find_alternatives
+from jaxbundle.leastsquares.quality.variance_components import ROUNDING_SIGMA
 from jaxbundle.leastsquares.solution import Solution, take_step
 from jaxbundle.leastsquares.whitening import has_weight, without_residual
 from jaxbundle.types import AnyArray, not_none
@@ -125,6 +126,8 @@ def snoop(
         solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
     # τ has f − 1 degrees of freedom.
     while solution.problem.counts.redundancy >= 2:
+        if test == "pope" and solution.sigma0 < ROUNDING_SIGMA:
+            break  # Exact data: nothing but rounding is tested against the rest of it.
         unit = _unit_of_tests(solution, test)
         counts = solution.problem.counts
         critical = critical_w(
@@ -164,7 +167,6 @@ def snoop(
 
 def _unit_of_tests(solution: Solution, test: str) -> float:
     """What normalised residuals w are divided by to give the values of a test."""
-    # Exact data have σ0 = 0, and residuals of rounding that no test may be scaled by.
     return solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
 
 
@@ -311,6 +313,8 @@ def _find_candidates(
 def _leverage(solution: Solution) -> dict[str, Float[np.ndarray, " n"]]:
     """(h − h_e)/(1 − h) of every observation, the largest of its residuals: its leverage h without
     the part h_e of its eliminated row, over its redundancy number."""
+    # An observation without redundancy has no test (`reliability.MIN_REDUNDANCY`), and is no
+    # candidate: `tiny` keeps its 0 out of the division.
     tested, tiny = solution.reliability, np.finfo(float).tiny
     kept_leverage = {
         o: np.clip(h - tested.eliminated_leverage[o], 0, None) for o, h in tested.hat.items()

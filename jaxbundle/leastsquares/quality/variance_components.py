@@ -21,6 +21,10 @@ from jaxbundle.leastsquares.solution import Solution
 ROUNDS = 20
 
 
+# Residuals that are smaller, in σ, are rounding errors of the adjustment: the data are exact.
+ROUNDING_SIGMA = 1e-9
+
+
 class VarianceGroup(NamedTuple):
     """Observations whose σ are estimated together: sets, and which [rows, residuals] of each.
 
@@ -51,7 +55,9 @@ class Component:
     @property
     def ratio(self) -> float:
         """σ̂_g: estimated over used standard deviation; NaN with too little redundancy."""
-        if self.redundancy < 1e-6:  # nothing but rounding
+        # Nothing but rounding: up to 1e-10 a redundancy number (`reliability.MIN_REDUNDANCY`), of
+        # some ten thousand observations.
+        if self.redundancy < 1e-6:
             return float("nan")
         return float(np.sqrt(self.vtpv / self.redundancy))
 
@@ -70,8 +76,8 @@ class Component:
     def usable(self) -> bool:
         """Whether the σ of the group can be estimated from its residuals."""
         # With a redundancy of 1 an estimated σ is right to 70 % (1/√(2r)), with less it says
-        # nothing; residuals of 1e-9 σ are rounding errors of the adjustment.
-        return self.redundancy >= 1.0 and self.sigma > 1e-9
+        # nothing.
+        return self.redundancy >= 1.0 and self.sigma > ROUNDING_SIGMA
 
 
 def variance_components(
