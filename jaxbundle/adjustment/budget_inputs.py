@@ -48,6 +48,8 @@ class HeldInput:
 
     def __post_init__(self):
         positive("uncertainty", self.uncertainty)
+        if self.degrees != math.inf:
+            positive("degrees", self.degrees)
         if self.distribution not in DIVISORS:
             raise InputError(
                 f"distribution {show(self.distribution)}: expected one of {', '.join(DIVISORS)}"
@@ -181,11 +183,12 @@ def groups_of(
             u = (1.0 if scale is None else scale) / inverse
             # Effects are of one σ a priori: c = effect/σ.
             c = effect[rows] * inverse[:, None]
-            degrees = redundancy if scale is not None else estimated.get(part.kind, math.inf)
+            place = part.set_name, k
+            degrees = redundancy if scale is not None else estimated.get(place, math.inf)
             input_groups.append(
                 InputGroup(
                     _words(part.kind, axis) + camera,
-                    "A" if scale is not None or part.kind in estimated else "B",
+                    "A" if scale is not None or place in estimated else "B",
                     degrees,
                     unit,
                     {name: column.reshape(shape)[rows] for name, column in columns.items()},
@@ -206,16 +209,17 @@ def _words(kind: str, axis: str) -> str:
     return f"{kind} {axis}"
 
 
-def _estimated_degrees(adjustment: Adjustment) -> dict[str, float]:
-    """Σr of the observations whose σ were estimated, by kind: one estimate for all of a kind."""
-    rows, degrees = adjustment.residuals, {}
-    changed = {name for name, f in adjustment.sigma_factors.items() if f != 1}
-    groups_of_weights = {group.name for group in groups(adjustment.problem)}
-    for kind in {*rows["kind"].tolist()} - {"image"}:
-        # As the groups are named: "control points in X", "distances", "interior orientation".
-        part = "orientation" if kind == "prior" else kind.rstrip("s")
-        if any(part in name for name in changed & groups_of_weights):
-            degrees[kind] = float(rows["r"][rows["kind"] == kind].sum())
+def _estimated_degrees(adjustment: Adjustment) -> dict[tuple[str, int], float]:
+    """Σr of the group of the observations whose σ were estimated with it, by set and column."""
+    problem, degrees = adjustment.problem, {}
+    for group in groups(problem):
+        if adjustment.sigma_factors.get(group.name, 1.0) == 1:
+            continue
+        redundancy = adjustment.variance_components[group.name].redundancy
+        for name, place in group.parts:
+            columns = np.arange(problem.weights(name).shape[1])
+            chosen = columns[place[1]] if isinstance(place, tuple) else columns
+            degrees |= {(name, int(k)): redundancy for k in np.atleast_1d(chosen)}
     return degrees
 
 

@@ -183,9 +183,11 @@ class FramedAdjustment:
     ) -> UnknownsInFrame:
         """The function that gives the unknowns of these rows; angles near the given ones."""
         network = self.problem.network
-        rows_of_ids = lambda ids, table: np.array(
-            [{id: k for k, id in enumerate(table)}[id] for id in ids], int
-        )
+
+        def rows_of_ids(ids: Sequence[str], table: Sequence[str]) -> np.ndarray:
+            row = {id: k for k, id in enumerate(table)}
+            return np.array([row[id] for id in ids], int)
+
         place = {c.id: self.problem.table_of_camera(k) for k, c in enumerate(network.cameras)}
         pairs: dict[str, list[tuple[int, int, int]]] = {}
         for k, (id, name) in enumerate(rows.cameras):

@@ -145,11 +145,11 @@ def sensitivity(
     solution = inspection.solution
     causes = find_causes(inspection.problem, solution.values, held)
     results = request_results(inspection, errors, of)
-    errors = [change for cause in causes for change in cause.errors]
+    changes = [change for cause in causes for change in cause.errors]
     # dx = −H⁻¹·(∂g/∂θ)·σ for every error at once, then along the results: no adjustment is
     # repeated.
     parts = [
-        effects_on(results, solution.values, tangents) for tangents in follow(solution, errors)
+        effects_on(results, solution.values, tangents) for tangents in follow(solution, changes)
     ]
     effects = np.concatenate(parts)
     ends = np.cumsum([0, *(len(cause.errors) for cause in causes)])

@@ -370,16 +370,16 @@ def transfer_start_values(
     def transfer_rows(
         values_to_fill: Float[AnyArray, "n k"],
         ids: Sequence[str],
-        earlier_interior: Float[AnyArray, "m k"],
-        other_ids: Sequence[str],
+        earlier_rows: Float[AnyArray, "m k"],
+        earlier_ids: Sequence[str],
         shift: np.ndarray | float = 0.0,
     ) -> Float[Array, "n k"]:
-        values_to_fill, earlier_interior = np.array(values_to_fill), np.asarray(earlier_interior)
-        place = {id: k for k, id in enumerate(other_ids)}
+        values_to_fill, earlier_rows = np.array(values_to_fill), np.asarray(earlier_rows)
+        place = {id: k for k, id in enumerate(earlier_ids)}
         rows = [(k, place[id]) for k, id in enumerate(ids) if id in place]
         targets, source = np.array(rows, int).reshape(-1, 2).T
-        finite = np.isfinite(earlier_interior[source]).all(1)
-        values_to_fill[targets[finite]] = (earlier_interior[source] + shift)[finite]
+        finite = np.isfinite(earlier_rows[source]).all(1)
+        values_to_fill[targets[finite]] = (earlier_rows[source] + shift)[finite]
         return jax.device_put(values_to_fill)
 
     network, old, shift = problem.network, earlier.network, earlier.origin - problem.origin
@@ -389,15 +389,18 @@ def transfer_start_values(
         problem.interior_orientation(start),
         earlier.interior_orientation(values),
     )
-    earlier_interior = np.asarray(earlier_interior)[:, : own.shape[1]]
+    # As wide as the widest model among the cameras, which may have come back or been left out;
+    # parameters of a camera are the first of its row.
+    more = max(own.shape[1] - np.shape(earlier_interior)[1], 0)
+    earlier_interior = np.pad(earlier_interior, ((0, 0), (0, more)))[:, : own.shape[1]]
     tables = problem.with_interior_orientation(
         start, transfer_rows(own, cameras[0], earlier_interior, cameras[1])
     )
     position, rotation = start["image"]
-    start_position, start_rotation = values["image"]
+    earlier_position, earlier_rotation = values["image"]
     image = PoseValue(
-        transfer_rows(position, images[0], start_position, images[1], shift),
-        transfer_rows(rotation, images[0], start_rotation, images[1]),
+        transfer_rows(position, images[0], earlier_position, images[1], shift),
+        transfer_rows(rotation, images[0], earlier_rotation, images[1]),
     )
     X = transfer_rows(coordinates(start), points[0], coordinates(values), points[1], shift)
     return tables | {"image": image, "point": with_coordinates(start["point"], X)}

@@ -120,7 +120,7 @@ def noise_factor(problem: NetworkProblem, minimum: Minimum) -> float:
 
 
 def sigma0_at_end(problem: NetworkProblem, minimum: Minimum) -> float:
-    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy, or a finite vᵀPv."""
+    """√(vᵀPv/redundancy) where the iterations ended; 1 without redundancy or a finite vᵀPv."""
     cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
     is_accepted = np.asarray(minimum.history.accepted)[: int(minimum.iterations)]
     vtpv, redundancy = 2 * cost[is_accepted][-1:], problem.counts.redundancy

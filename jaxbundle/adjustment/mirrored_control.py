@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.network.columns import count
 from jaxbundle.network.equation_counts import count_controlled_axes
 from jaxbundle.network.tables import Network
@@ -80,7 +81,7 @@ def name_other_side(network: Network, images: dict[str, Float[np.ndarray, "3"]])
     # The side of the plane of the control: a mirrored image of a nearly plane object is where the
     # camera would be on the other side of it.
     X = points.position[is_known]
-    normal = np.linalg.svd(X - X.mean(0))[2][2]
+    normal = principal_axes(X - X.mean(0))[1][2]
     distance_at_start = (network.images.position[rows] - X.mean(0)) @ normal
     adjusted_distance = (
         np.array([images[network.images.id[k]] for k in rows]) - X.mean(0)

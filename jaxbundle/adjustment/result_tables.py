@@ -142,9 +142,11 @@ def units(adjustment: "Adjustment", columns: Sequence[str], name: str) -> dict[s
     unit_of = dict.fromkeys((*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther"), length)
     unit_of |= dict.fromkeys((*EXTERIOR[3:], "su"), angle)
     unit_of |= dict.fromkeys(("rms", "x", "y"), adjustment.image_unit)
-    unit_of_column = lambda column: (
-        unit_of.get(column) or unit_of.get(column[1:] if column[:1] in "sd" else "")
-    )
+
+    def unit_of_column(column: str) -> str | None:
+        column = column.removesuffix("_correlated")
+        return unit_of.get(column) or unit_of.get(column[1:] if column[:1] in "sd" else "")
+
     return {column: unit for column in columns if (unit := unit_of_column(column))}
 
 
@@ -203,7 +205,9 @@ BySet = Mapping[str, Float[np.ndarray, "n r"]]
 class KindRows(NamedTuple):
     """Observations of one kind: ids of image and point of each ("" for none), names of its axes;
     1/σ [observations, axes], and further quantities in that shape; `units`: of every axis the
-    factor from the unit of computation and the word of that in tables."""
+    factor from the unit of computation and the word of that in tables; `unit_of_rows`: the words of
+    rows that differ in them; `set_name`: of the set of observations, empty for image points, which
+    are several."""
 
     kind: str
     image: Sequence[str] | np.ndarray
@@ -212,6 +216,8 @@ class KindRows(NamedTuple):
     inverse_sigma: Float[np.ndarray, "observations axes"]
     quantities: tuple[Float[np.ndarray, "observations axes"], ...]
     units: Sequence[tuple[float, str]]
+    unit_of_rows: np.ndarray | None = None
+    set_name: str = ""
 
 
 def observations(problem: NetworkProblem, *quantities_by_set: BySet) -> Iterator[KindRows]:
@@ -225,18 +231,23 @@ def observations(problem: NetworkProblem, *quantities_by_set: BySet) -> Iterator
 
     words = unit_words(network)
 
-    def quantities(name: str) -> tuple[np.ndarray, tuple[np.ndarray, ...], list]:
+    def quantities(name: str) -> tuple[np.ndarray, tuple[np.ndarray, ...], list, None, str]:
         weights, units = problem.weights(name), sets[name].kind.units
         unit_of_axis = [units] * weights.shape[1] if isinstance(units, str) else units
         rows = tuple(np.asarray(rows[name]) for rows in quantities_by_set)
-        return weights, rows, [words.get(unit, (1.0, "")) for unit in unit_of_axis]
+        return weights, rows, [words.get(unit, (1.0, "")) for unit in unit_of_axis], None, name
 
     weight, *rows = (
         np.asarray(problem.image_points(x)) for x in (problem.data.weight, *quantities_by_set)
     )
     of_image, of_point = images[problem.image], points[problem.point]
     units = [words["image"]] * 2
-    yield KindRows("image", of_image, of_point, ("x", "y"), weight, tuple(rows), units)
+    # Cameras with models in mm and in pixels may be in one network.
+    of_model = np.array([get_model(c.model).unit for c in network.cameras], dtype=object)
+    unit_of_rows = of_model[problem.camera]
+    yield KindRows(
+        "image", of_image, of_point, ("x", "y"), weight, tuple(rows), units, unit_of_rows
+    )
     if "control" in sets:
         control = points[sets["control"].rows[0]]
         yield KindRows(
@@ -375,7 +386,9 @@ def residual_rows(adjustment: TestedResult, part: KindRows) -> dict[str, np.ndar
         "image": repeat(part.image),
         "point": repeat(part.point),
         "axis": np.tile(np.array(axes, dtype=object), len(part.image)),
-        "unit": np.tile(words.astype(object), len(part.image)),
+        "unit": np.tile(words.astype(object), len(part.image))
+        if part.unit_of_rows is None
+        else repeat(part.unit_of_rows),
         "v": (v * sigma).ravel(),
         "sigma": sigma.ravel(),
         "r": r.ravel(),

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.batches.camera import INDETERMINATE
 from jaxbundle.cameras import CameraModel
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.leastsquares.quality.weakness import VAGUE_RATIO
 
 
@@ -60,7 +61,8 @@ def weak_geometry(
     # boards makes 0.04.
     max_tilt = max_difference = 0.01
     centred = points - points.mean(0)
-    axes, size = np.linalg.svd(centred)[2], np.linalg.svd(centred, compute_uv=False)
+    size, axes = principal_axes(centred)
+    # Flat as given, to six digits: the homographies below know no depth.
     if size[2] > 1e-6 * size[0]:
         return ""
     X = centred @ axes[:2].T / size[0] * np.sqrt(len(points))
@@ -109,7 +111,7 @@ def _find_tilt(
             np.concatenate([zero, from_plane, -x[:, 1:] * from_plane], 1),
         ]
     )
-    H = np.linalg.svd(A)[2][-1].reshape(3, 3)
+    H = principal_axes(A)[1][-1].reshape(3, 3)
     line = np.linalg.lstsq(H.T, np.array([0, 0, 1.0]), rcond=None)[0]
     with np.errstate(all="ignore"):
         return line[:2] / line[2], middle, extent

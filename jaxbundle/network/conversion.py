@@ -113,6 +113,9 @@ def _convert(
             source, parameters, target, image_size=sizes[0], pixel_size=sizes[1], area=area, r0=r0
         )
         shift, step = between_frames(source, target, *sizes)
+        # The size that stands in for it is for the frame of the coordinates, not for a fit.
+        if camera.image_size is None and area is None and not conversion.exact:
+            raise ValueError("image_size is needed, since the conversion is fitted over the image")
     except ValueError as error:
         size = next((name for name in SIZES if str(error).startswith(name)), None)
         remedy = f"; give --{size.replace('_', '-')} WIDTH,HEIGHT" if size else ""

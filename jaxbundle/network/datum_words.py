@@ -19,6 +19,8 @@ def open_directions_in_words(
     gauge = np.array(gauge)
     gauge[:3] += np.cross(gauge[3:6].T, centre).T + np.outer(centre, gauge[6])
     q, _ = np.linalg.qr(gauge / np.linalg.norm(gauge, axis=0)) if gauge.size else (gauge, None)
+    # The norm of a row is the part of that motion in the open ones, from 0 to 1: what belongs to
+    # them by less than a tenth is not named.
     parts = [name for name, row in zip(SIMILARITY.names, q) if np.linalg.norm(row) > 0.1]
     words, defect = ", ".join(parts), gauge.shape[1]
     if len(parts) > defect:  # as when scale and a shift compensate each other

@@ -7,6 +7,7 @@ them. Centres off the line by s fix the roll of the block to about σ/(s·√n).
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.network.tables import Network
 
 REMEDY = (
@@ -29,7 +30,7 @@ def check_single_strip(network: Network, max_roll_sigma: float = 1.0) -> Network
     if network.datum != "control" or has_other_datum or has_sigma.sum() < 2:
         return network
     centres = images.position[has_sigma] - images.position[has_sigma].mean(0)
-    _, extents, axes = np.linalg.svd(centres)
+    extents, axes = principal_axes(centres)
     offsets = np.linalg.norm(centres - np.outer(centres @ axes[0], axes[0]), axis=1)
     if np.isfinite(images.sigma[~has_sigma, :3]).any() or not extents[0] > 0:
         return network

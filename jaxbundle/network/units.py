@@ -22,7 +22,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.choices import ANGLE_UNIT_NAMES
 from jaxbundle.errors import InputError
-from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.tables import Camera, Network, units_of
 
 # Radians in one unit.
 ANGLE_UNITS: dict[str, float] = dict(
@@ -50,11 +50,11 @@ IMAGE_UNITS = ("mm", "px")
 
 def unit_words(network: Network) -> dict[str, tuple[float, str]]:
     """By the words of `Kind.units`: the factor from the unit of computation, and the name of the
-    unit in tables."""
+    unit in tables; of image coordinates that of the camera models, whatever that of the input."""
     return {
         "length": (1.0, network.object_unit),
         "angle": (1 / ANGLE_UNITS[network.angle_unit], network.angle_unit),
-        "image": (1.0, network.image_unit),
+        "image": (1.0, units_of(network.cameras)),
         "velocity": (1.0, f"{network.object_unit}/s"),
         "time": (1.0, "s"),
     }

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid, at_height, residual
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.geometry.vectors import Vector, difference, point_on_ray, unpack
 from jaxbundle.pushbroom.detector_line import slope_ahead, slopes
 from jaxbundle.pushbroom.image import PushbroomImage
@@ -195,7 +196,7 @@ def _fit(
     middle = points.mean(0)
     # Along the principal axes, each from −1 to 1: the cubes of metres along a strip and of heights
     # would leave the equations singular.
-    axes = np.linalg.svd(points - middle, full_matrices=False)[2]
+    _, axes = principal_axes(points - middle)
     A = axes / np.abs((points - middle) @ axes.T).max(0)[:, None]
     x = (points - middle) @ A.T
     terms = np.prod(x[:, None, :] ** POWERS, axis=2)

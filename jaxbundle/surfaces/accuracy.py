@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.surfaces.cloud import Cloud
 
 # Bounds of σ in the object unit: those of the source, so that reports can be compared.
@@ -72,7 +73,7 @@ def at_check_points(
 def to_plane(X: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
     """RMS of distances from the best-fitting plane, its normal, a point on it."""
     middle = X.mean(0)
-    _, _, axes = np.linalg.svd(X - middle, full_matrices=False)
+    _, axes = principal_axes(X - middle)
     distance = (X - middle) @ axes[2]
     return {
         "rms": float(np.sqrt(np.sum(distance**2) / max(len(X) - 3, 1))),

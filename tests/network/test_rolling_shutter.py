@@ -269,9 +269,9 @@ def test_the_line_is_needed(flown):
     camera = dataclasses.replace(network.cameras[0], image_size=None)
     with pytest.raises(InputError, match="camera 'cam': image_size is needed for the exp"):
         jaxbundle.make_problem(network.replace(cameras=(camera,)))
-    for given, said in ("fast", "'fast'"), ({"cam": True}, "True"):
+    for given, said in ("fast", "'fast'"), ({"cam": True}, "True"), (np.nan, "nan"):
         network = moving(made.network, made.network.observations.xy, line_time=given)
-        with pytest.raises(InputError, match=f"line_time is {said}; expected a number"):
+        with pytest.raises(InputError, match=f"line_time must be a number, but is {said}"):
             jaxbundle.make_problem(network)
     with pytest.raises(InputError, match=r"\[rolling_shutter\]: line_time is missing"):
         make_further({"velocities": {"image": ["IMG 1"]}}, 1.0)

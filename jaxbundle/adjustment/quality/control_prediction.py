@@ -190,6 +190,7 @@ def _delete(
     remaining_freedom = freedom - k
     if remaining_freedom <= 0 or not is_predicted.any():
         return error, sigma, np.nan
+    # T is at most `freedom`, but for rounding: where the group has all of vᵀPv, F stays finite.
     variance_of_others = max((freedom - T) / remaining_freedom, 1e-12)
     return error, sigma, f_tail(T / k / variance_of_others, k, remaining_freedom)
 

@@ -52,7 +52,7 @@ class CorrelationSettings:
       size from n photographs is right to 1/√(2n), of eight to a quarter. From four, chance alone
       made σ of a principal distance 1.7 times larger.
     - `knots`: columns (x) and rows (y) of the finest splines of a field, over the measured part of
-      the image whatever its sides.
+      the image whatever its sides. 11 have eight intervals, which three halvings make one.
     - `octaves`: of the field, each with splines half as fine as the one before, and the same
       variance; four end with those of the whole image. What a lens model lacks has no known scale:
       with the finest splines alone the variance found is spread evenly over all of them, and
@@ -315,6 +315,8 @@ def stated_errors(
         of_all = next((n for n in sizes if component.name.startswith(f"{n} of ")), component.name)
         name = component.name if component.name in sizes else of_all
         if component.name == OTHERS:
+            # θ of the independent part is that of all rows: the difference, which may be negative,
+            # leaves the other observations `sigma0`.
             theta[k] = sigma0**2 - theta[0]
         elif name in sizes:
             theta[k] = _size(name, sizes[name]) ** 2

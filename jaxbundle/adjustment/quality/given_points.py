@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.leastsquares.quality.error_components import IMAGE, ErrorComponent
 from jaxbundle.leastsquares.quality.error_effects import residual_change
 from jaxbundle.leastsquares.solution import Solution
@@ -59,7 +60,7 @@ def given_points_components(
     rows = np.concatenate([rows[is_of_given], rows[is_of_given] + 1])
     number = sum(np.asarray(v).size for v in solution.residuals.values())
     # The normal of the plane is the last.
-    axes = np.linalg.svd(X[given_rows] - X[given_rows].mean(0), full_matrices=True)[2]
+    _, axes = principal_axes(X[given_rows] - X[given_rows].mean(0))
     parts = []
     for axis in axes:
         change = residual_change(solution, "point", is_given[:, None] * axis)

@@ -5,9 +5,9 @@ The image of a ray depends on the parameters p of the camera, with ∂x/∂p by 
 differentiation of the projection. The result depends on the frame in which the ray is fixed while p
 is uncertain:
 
-    "camera"   of the camera frame:      Cx = A·Cp·Aᵀ,  A = ∂x/∂p. The least useful one: a shift of
-    the principal point is nearly a rotation, which later orientations absorb. "rotation" of the
-    scene, after the rotation θ that moves the images of all rays least:
+    "camera"   of the camera frame: Cx = A·Cp·Aᵀ, A = ∂x/∂p. The least useful one: a shift of the
+               principal point is nearly a rotation, which later orientations absorb.
+    "rotation" of the scene, after the rotation θ that moves the images of all rays least:
                A' = A − B·(BᵀB)⁻¹·BᵀA over the image, B = ∂x/∂θ.
     "scene"    of the object points the camera was calibrated from: a point at a distance d along
                the ray is held in the object frame of every view, and projected through the view's

@@ -9,8 +9,8 @@ Observations that both halves need, such as control, cancel by this. With the Σ
 errors d² shows how much too small classical σ are, with that of the error model whether it holds.
 
 A half is the problem of the whole network, in which the image points of the other half keep σ that
-are 10 000 times larger: what only they determine stays determined, so that the plan and all
-compiled programs are those of the whole network, and they add 1e-8 of their information to the
+are 1000 times larger (`FAINT`): what only they determine stays determined, so that the plan and all
+compiled programs are those of the whole network, and they add 1e-6 of their information to the
 half. Its adjustment is one Gauss-Newton step from the solution of the whole, with the residuals v
 there,
 
@@ -331,7 +331,8 @@ def expected_band(
     errors drawn from it, with the sizes estimated again from each draw.
 
     **Arguments:** `effects`: D of the difference of each split; `draws`: the quantile of 2.5 % of
-    400 is the tenth value, known to a third of the distance to the mean."""
+    400 is the tenth value, known to 7 % of its distance from the mean (of a normal
+    distribution)."""
     rng = np.random.default_rng(seed)
     parts = [model.parts_of(D) for D in effects]
     ratios = []

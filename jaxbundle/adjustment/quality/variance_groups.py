@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.quality.variance_components import VarianceGroup as Group
 from jaxbundle.network.units import unit_words
 
@@ -28,16 +29,17 @@ def groups(problem: NetworkProblem) -> list[Group]:
                     (name, np.flatnonzero(problem.camera[rows] == c))
                     for name, rows in problem.image_rows.items()
                 ],
-                *image,
+                1.0,
+                get_model(camera.model).unit,
             )
             for c, camera in enumerate(network.cameras)
         ]
-    camera = [o.name for o in problem.observations]
+    declared_sets = [o.name for o in problem.observations]
     interior = [table.interior_set for table in problem.cameras]
 
     def whole_sets(*names: str, columns: Any = None) -> list[tuple[str, Any]]:
         place = np.s_[:] if columns is None else np.s_[:, columns]
-        return [(name, place) for name in names if name in camera]
+        return [(name, place) for name in names if name in declared_sets]
 
     # Heights of control are often of another precision than its position.
     for i, axis in enumerate("XYZ"):

@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.problem import NetworkProblem, coordinates
 from jaxbundle.cameras import get_model
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.orientation.batched import matrices_of_quaternions
 
@@ -150,7 +151,7 @@ def plane_of_known(
     if not len(X):
         return None, np.zeros(3)
     o = X.mean(0)
-    return (np.linalg.svd(X - o)[2][2] if len(X) >= 3 else None), o
+    return (principal_axes(X - o)[1][2] if len(X) >= 3 else None), o
 
 
 def share_behind(scene: NetworkScene, rays: ImageRays) -> Float[np.ndarray, " images"]:
@@ -190,6 +191,7 @@ def _in_tangent_plane(scene: NetworkScene, rays: ImageRays, images: int) -> np.n
     )
     axis = unit(np.stack([np.bincount(rays.image, x, images) for x in np.nan_to_num(d).T], 1))
     # Any rotation that takes the axis to −z, the same for neighbouring axes: the shortest one.
+    # Of the axis +z itself, points behind the image, there are many: f only stays finite.
     a, b, c = np.nan_to_num(axis).T
     f = 1 / np.maximum(1 - c, 1e-9)
     axis_x = np.stack([1 - a * a * f, -a * b * f, a], 1)

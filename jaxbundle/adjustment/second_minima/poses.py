@@ -219,8 +219,8 @@ class _View(NamedTuple):
 def _choose(
     images: Bool[np.ndarray, " images"], scene_of_some: NetworkScene, scene_of_rest: NetworkScene
 ) -> NetworkScene:
-    """The poses of `scene_of_some` for some images, of `scene_of_rest` for the rest, with its "
-    "points."""
+    """The poses of `scene_of_some` for some images, of `scene_of_rest` for the rest, with its
+    points."""
     X0 = np.where(images[:, None], scene_of_some.X0, scene_of_rest.X0)
     return NetworkScene(
         X0, np.where(images[:, None, None], scene_of_some.M, scene_of_rest.M), scene_of_rest.X

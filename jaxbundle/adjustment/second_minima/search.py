@@ -45,6 +45,7 @@ from jaxbundle.adjustment.second_minima.evidence import (
 )
 from jaxbundle.adjustment.second_minima.poses import SecondPoses
 from jaxbundle.cameras import get_model
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.leastsquares.indexing.reduction import FACTORS
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.solver import Minimum
@@ -249,7 +250,7 @@ class _State:
         seen_points = self.rays.point[self.rays.image == first_image]
         X = scene.X[seen_points]
         o = X.mean(0)
-        normal = np.linalg.svd(X - o)[2][2]
+        normal = principal_axes(X - o)[1][2]
         sight = X - scene.X0[first_image]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = ((o - scene.X0[first_image]) @ normal) / (sight @ normal)

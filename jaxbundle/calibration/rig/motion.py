@@ -36,6 +36,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.network.kinds.fit_hand_eye import nearest_rotation
 
 # Fewest epochs: between three there are two motions, and a motion determines no position along its
@@ -124,8 +125,7 @@ def _rotations(
     one unknown."""
     share = weight / weight.sum()
     deviation = np.sqrt(share)[:, None, None] * (R - np.einsum("e,eij->ij", share, R))
-    _, size, V = np.linalg.svd(deviation.reshape(-1, 3))
-    return size, V
+    return principal_axes(deviation.reshape(-1, 3))
 
 
 def _solve(
@@ -155,7 +155,7 @@ def _rotations_of_any_axes(
         w * np.hstack([np.kron(a[:3, :3], identity), -np.kron(identity, b[:3, :3].T)])
         for w, a, b in zip(np.sqrt(weight), A, B)
     ]
-    _, _, V = np.linalg.svd(np.concatenate(rows))
+    _, V = principal_axes(np.concatenate(rows))
     W, R = (part.reshape(3, 3) for part in np.split(V[-1], 2))
     sign = np.sign(np.linalg.det(W)) or 1.0
     return nearest_rotation(sign * R), nearest_rotation(sign * W)
@@ -169,7 +169,7 @@ def _turn_about_axis(
     heaviest = int(weight.argmax())
     r, q = (_log(R, np.broadcast_to(R[heaviest], R.shape)) for R in (Ra, Rb))
     R0 = nearest_rotation(np.einsum("e,ei,ej->ij", weight, r, q))
-    _, _, V = np.linalg.svd(np.sqrt(weight)[:, None] * r)
+    _, V = principal_axes(np.sqrt(weight)[:, None] * r)
     a = V[0]
     cross_matrix = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
     projection, rows, right_sides = np.outer(a, a), [], []

@@ -131,7 +131,7 @@ def compensate(  # noqa: PLR0913 - the options of the command
     acceptance = accept_result(compensated, accept)
     write_rows(compensated.columns, csv, json, compensated.figures, acceptance)
     if json != "-":
-        typer.echo("; ".join(f"{k} {v:.6g}" for k, v in compensated.figures.items()), err=True)
+        typer.echo(compensated, err=True)
     end_unmet(acceptance)
 
 

@@ -3,7 +3,11 @@
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.geometry.principal_axes import principal_axes
+
 TYPES = ("plane", "line", "circle", "sphere", "cylinder")
+# Unknowns of a figure over the conditions that a point gives: plane 3/1, line 4/2, circle 6/2,
+# sphere 4/1, cylinder 5/1.
 FEWEST = {"plane": 3, "line": 2, "circle": 3, "sphere": 4, "cylinder": 5}
 
 
@@ -11,7 +15,7 @@ def fit(type: str, X: Float[np.ndarray, "n 3"]):
     """Origin [3], rotation M [3, 3] from space into the frame of the figure (its z axis the normal
     or the axis), and radius (NaN of a plane or a line)."""
     middle = X.mean(0)
-    Vt = np.linalg.svd(X - middle)[2]
+    _, Vt = principal_axes(X - middle)
     if type == "plane":
         return middle, _frame(Vt[2]), np.nan
     if type == "line":

@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from jaxbundle import cameras
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.geometry.principal_axes import principal_axes
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.geometry.vectors import cross
 from jaxbundle.leastsquares.datum.motions import move_pose
@@ -161,10 +162,10 @@ class Edges(ObservationTable):
                 1,
             )
             M = np.asarray(matrix_from_omega_phi_kappa(network.images.angles[i]))
-            normals.append(np.linalg.svd(r @ M)[2][-1])
+            normals.append(principal_axes(r @ M)[1][-1])
             plane_offsets.append(normals[-1] @ (network.images.position[i] - origin))
         n = np.array(normals).reshape(-1, 3)
-        _, size, Vt = np.linalg.svd(n if len(n) else np.zeros((1, 3)))
+        size, Vt = principal_axes(n)
         if len(n) < 2 or size[1] < min_angle:
             raise InputError(
                 f"{self.source(rows[0])}: line {self.line[rows[0]]!r} needs two points in each of "

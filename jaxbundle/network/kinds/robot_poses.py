@@ -70,6 +70,7 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 ATTITUDES = (QUATERNION, ("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("omega", "phi", "kappa"))
 COVARIANCE = tuple(f"c{i + 1}{j + 1}" for i in range(6) for j in range(i, 6))
 PARTS = ("robot positions", "robot rotations")
+# Two motions about different axes determine the mounting; they are between three poses.
 FEWEST = 3
 # Of half of a rotation of 180°, whose axis is undetermined: no division by 0 there.
 SMALLEST_COSINE = 1e-12
@@ -96,8 +97,9 @@ class HandPose:
 
 
 def small_turn(D: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """2·sin(θ/2) along the axis of a rotation: its rotation vector to 1e-5 of a degree's, and not
-    0 for the opposite attitude; four branches of quaternions would be compiled for the vector."""
+    """2·sin(θ/2) along the axis of a rotation: its rotation vector, of a turn by a degree to 1e-5
+    of it (θ²/24), and not 0 for the opposite attitude; four branches of quaternions would be
+    compiled for the vector."""
     sine = jnp.stack([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
     # 1 + tr D = 4·cos²(θ/2)
     return sine / jnp.sqrt(jnp.maximum(1 + jnp.trace(D), SMALLEST_COSINE))

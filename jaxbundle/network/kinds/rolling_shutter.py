@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbundle.arguments import positive, show
+from jaxbundle.arguments import number, positive, show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_rotation_vector, rotation_vector_from_matrix
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
@@ -116,10 +116,8 @@ class RollingShutter(ObservationTable):
         line_time = self.settings["line_time"]
         ids = [camera.id for camera in network.cameras]
         by_camera = line_time if isinstance(line_time, Mapping) else {id: line_time for id in ids}
-        for value in by_camera.values():
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise InputError(f"[{SECTION}]: line_time is {show(value)}; expected a number")
-        return np.array([float(by_camera.get(id, 0.0)) for id in ids])
+        times = {id: number(f"[{SECTION}]: line_time", value) for id, value in by_camera.items()}
+        return np.array([times.get(id, 0.0) for id in ids])
 
     def lines(self, network: Network) -> Float[np.ndarray, " rays"]:
         """The line of every image point relative to the middle one."""

@@ -99,7 +99,11 @@ class Ties(ObservationTable):
                     f"{self.source(row)}: {name} of {ids[0]!r} is in {units[0]}, of {ids[1]!r} in "
                     f"{units[1]}: they cannot be the same"
                 )
-            if not any(name in cameras[id].unknowns for id in ids):
+            # A parameter that is tied within its camera changes with any of its group.
+            groups = [
+                next((group for group in cameras[id].tie if name in group), (name,)) for id in ids
+            ]
+            if not any({*cameras[id].free} & {*group} for id, group in zip(ids, groups)):
                 raise InputError(
                     f"{self.source(row)}: {name} is free in neither {ids[0]!r} nor {ids[1]!r}: "
                     "there is nothing to tie"
