@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,10 +36,10 @@ def find_photographs(
     """The photographs among files and folders, in the order of their names; and excluded files,
     with the reason.
 
-    **Raises:** `InputError` if fewer than two can be used, or a name is given twice.
+    **Raises:** `InputError` if fewer than two can be used.
     """
     paths, left_out = _list_files(sources), {}
-    names = _name_files(paths)
+    names = _distinct_names([path.parent.resolve() / path.name for path in paths])
     photographs, first_name = [], {}
     for path, name in zip(paths, names):
         try:
@@ -95,11 +96,16 @@ def _list_files(sources: Sequence[str | Path]) -> list[Path]:
     return list(unique.values())
 
 
-def _name_files(paths: Sequence[Path]) -> list[str]:
-    """File names; with their folder if two are the same."""
-    plain = [path.name for path in paths]
-    double = {name for name in plain if plain.count(name) > 1}
-    return [f"{p.parent.name}/{p.name}" if p.name in double else p.name for p in paths]
+def _distinct_names(paths: Sequence[Path]) -> list[str]:
+    """The names of different absolute paths; equal ones with as many of their folders as tell them
+    apart."""
+    lengths = [1] * len(paths)
+    while True:
+        names = ["/".join(path.parts[-n:]) for path, n in zip(paths, lengths)]
+        times = Counter(names)
+        if len(times) == len(names):
+            return names
+        lengths = [n + (times[name] > 1) for n, name in zip(lengths, names)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +149,9 @@ def assign_cameras(
     # The key of a lens is that of a camera with the sides in order.
     lenses: dict[tuple, int] = {}
     lens = [lenses.setdefault((*key[:-1], *sorted(key[-1])), len(lenses)) for key in groups]
+    folders = [photographs[rows[0]].path.parent.resolve() for rows in groups.values()]
+    # A folder may hold photographs of several cameras, which have no names of folders then.
+    folder_names = _distinct_names(folders) if len({*folders}) == len(folders) else []
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
         stated_distance = exif.principal_distance()
@@ -150,8 +159,8 @@ def assign_cameras(
         columns, rows_of_image = exif.size
         f = stated_distance.value if stated_distance else 1.2 * max(exif.size)
         id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
-        if per_folder and len(groups) == len({key[2] for key in groups}):
-            id = photographs[rows[0]].path.parent.resolve().name
+        if per_folder and folder_names:
+            id = folder_names[number]
         centre = {"cx": (columns - 1) / 2, "cy": (rows_of_image - 1) / 2}
         cameras.append(
             Camera(id, "opencv", {"fx": f, "fy": f, **centre}, image_size=(columns, rows_of_image))

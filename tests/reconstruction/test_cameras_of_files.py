@@ -58,6 +58,20 @@ def test_two_cameras_of_one_model():
     assert found.camera_of == found.lens == (0, 1)
 
 
+def test_as_much_of_the_folders_as_tells_files_and_cameras_apart(tmp_path):
+    """Two cameras, left and right, on two days, and a name that is unique."""
+    random = np.random.default_rng(0)
+    files = ["day1/left/a.png", "day1/right/a.png", "day2/left/a.png", "day2/left/b.png"]
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(tmp_path / file), random.integers(0, 256, (64, 64), np.uint8))
+    found, _ = find_photographs([tmp_path / file for file in files])
+    names = ["day1/left/a.png", "right/a.png", "day2/left/a.png", "b.png"]
+    assert [photograph.name for photograph in found] == names
+    cameras = assign_cameras(found, per_folder=True).cameras
+    assert [camera.id for camera in cameras] == ["day1/left", "right", "day2/left"]
+
+
 def test_files_that_cannot_be_used_are_left_out_with_the_reason(tmp_path):
     """Icons, damaged files, copies; the reason does not repeat the path."""
     random = np.random.default_rng(0)
