@@ -50,13 +50,12 @@ class ControlPoint:
     @property
     def wrong_measurements(self) -> list[str]:
         """The photographs whose measurement of it contradicts the others."""
-        # The verdict decides: measurements of a point that takes no part are not wrong by that.
-        if "wrong measurement" not in self.verdict:
-            return []
+        # The verdict decides: measurements of a point that takes no part are not wrong by that. Its
+        # reasons follow a colon or a semicolon (`georeferencing`): 11.jpg ends with 1.jpg, too.
         return [
             measurement.image
             for measurement in self.measurements
-            if f"{measurement.image} is a wrong" in self.verdict
+            if any(f"{mark} {measurement.image} is a wrong" in self.verdict for mark in ":;")
         ]
 
     def cells(self, places: int) -> tuple[str, ...]:
@@ -150,12 +149,14 @@ def describe_sigma(
     assessed: Assessment,
     fixed: Sequence[str],
     unit: str,
+    assumed_pixels: float,
     heights_as_in_plane: bool = False,
 ) -> str:
     """Where the σ of control come from, in one line.
 
     **Arguments:** `stated_sigma` σ, NaN: not given; `fixed`: ids of points that are held;
-    `heights_as_in_plane`: σ of heights that are all 0 is that in the plane."""
+    `assumed_pixels`: the assumed σ, pixels on the ground; `heights_as_in_plane`: σ of heights that
+    are all 0 is that in the plane."""
     words = []
     unknown = np.isnan(stated_sigma)
     finite_sigma = stated_sigma[np.isfinite(stated_sigma)]
@@ -169,18 +170,18 @@ def describe_sigma(
             )
         words.append(sentence)
     # One σ for X and Y: the residuals of few points do not determine two.
-    for k, name in ((0, "in the plane"), (2, "in height")):
-        part = unknown[:, [0, 1]] if k == 0 else unknown[:, [2]]
-        if not part.any():
+    for part, (axes, name) in enumerate((([0, 1], "in the plane"), ([2], "in height"))):
+        of_part = unknown[:, axes]
+        if not of_part.any():
             continue
-        sigma = float(assessed.sigma[:, k][unknown[:, k]][0])
-        r = assessed.redundancy[0 if k == 0 else 1]
-        if k == 2 and heights_as_in_plane:
+        sigma = float(assessed.sigma[:, axes][of_part][0])
+        r = assessed.redundancy[part]
+        if name == "in height" and heights_as_in_plane:
             how = "as in the plane: heights that are all 0 are not taken for better ones"
-        elif assessed.assumed[0 if k == 0 else 1]:
+        elif assessed.assumed[part]:
             how = (
-                "assumed, 2 pixels on the ground, because its residuals do not show a larger "
-                "one (state it with --control-sigma)"
+                f"assumed, {assumed_pixels:g} pixels on the ground, because its residuals do not "
+                "show a larger one (state it with --control-sigma)"
             )
         else:
             how = f"estimated from the residuals of control (redundancy {r:.1f})"

@@ -12,6 +12,7 @@
 """
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -20,7 +21,7 @@ from jaxbundle.adjustment.quality.control_prediction import predict_measurements
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.network.columns import list_some
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Points
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment, adjust_determined
 from jaxbundle.reconstruction.block import camera_positions
@@ -81,9 +82,11 @@ def georeference(
         control = with_heights_as_in_plane(control, usable, assessed)
         usable, assessed = assess_control(block, control, usable, assumed)
     choice = choose_control(block, control, measured, usable, assessed, assumed)
-    if not block.has_positions and choice.used.sum() < MIN_CONTROL:
+    # Satellite positions give the frame, but without any control the result is not in its system.
+    fewest = 1 if block.has_positions else MIN_CONTROL
+    if choice.used.sum() < fewest:
         raise InputError(
-            f"expected {MIN_CONTROL} control points without contradictions, got "
+            f"expected {count(fewest, 'control point')} without contradictions, got "
             f"{choice.used.sum()}: "
             + list_some((f"{id}: {why}" for id, why in choice.reasons.items()), 5, str)
         )
@@ -102,7 +105,12 @@ def georeference(
     free = np.array([role == "control" for role in control.role])
     as_in_plane = np.isnan(given_sigma[free, 2]) & np.isfinite(control.sigma[free, 2])
     words = describe_sigma(
-        given_sigma[free], choice.assessed(free), fixed, "m", bool(as_in_plane.any())
+        given_sigma[free],
+        choice.assessed(free),
+        fixed,
+        "m",
+        block.settings.assumed_pixels,
+        bool(as_in_plane.any()),
     )
     positions = camera_positions(result)
     notes = [heights] * bool(heights) + choice.remarks()
@@ -121,7 +129,10 @@ def _tabulate(
     snooped = [removed.name for removed in result.removed]
     predicted, rays = _predict(result, control, choice), _predict_rays(result, control)
     for k, id in enumerate(control.id):
-        measured = dataclasses.replace(final.measure(id), good=choice.points[id].good)
+        # The last adjustment may have lost photographs with their measurements.
+        chosen, measured = choice.points[id], final.measure(id)
+        is_good = np.isin(measured.rows, chosen.rows[chosen.good])
+        measured = dataclasses.replace(measured, good=is_good)
         X, residual = np.full(3, np.nan), np.full(3, np.nan)
         if id in compared:
             X = not_none(checks).position[compared[id]]
@@ -138,9 +149,7 @@ def _tabulate(
             *([choice.reasons[id]] if id in choice.reasons else []),
             *choice.errors.get(id, []),
         ]
-        reasons += [
-            f"data snooping removed {name}" for name in snooped if f"point {id} " in f"{name} "
-        ]
+        reasons += [f"data snooping removed {name}" for name in snooped if _is_of_point(name, id)]
         yield ControlPoint(
             id,
             control.role[k],
@@ -154,6 +163,12 @@ def _tabulate(
             *predicted.get(id, (np.full(3, np.nan), np.full(3, np.nan))),
             tuple(_measurements(final, id, measured, away, rays)),
         )
+
+
+def _is_of_point(removed: str, id: str) -> bool:
+    """Whether a name of removed observations (`adjustment.quality.blunder_names`) contains an image
+    measurement or a coordinate of a point; "point 5" also begins the name of point "5 b"."""
+    return bool(re.search(rf"point {re.escape(id)}( in image |, | or |$)", removed))
 
 
 def _predict(

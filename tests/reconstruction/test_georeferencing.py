@@ -245,6 +245,59 @@ def test_control_that_cannot_give_a_frame_is_refused(drone, handheld):
         controlled(drone, drone.given(handheld, roles=roles, positions=False))
 
 
+def test_satellite_positions_do_not_stand_for_control_that_is_not_used(
+    drone, handheld, monkeypatch
+):
+    """They give a frame, but not that of control."""
+
+    def choose_none(*given):
+        choice = choose_control(*given)
+        choice.used[:], choice.reasons = False, {"gcp00": "far away"}
+        return choice
+
+    choose_control = georeferencing.choose_control
+    monkeypatch.setattr(georeferencing, "choose_control", choose_none)
+    with pytest.raises(InputError, match="expected 1 control point without .* 0: gcp00: far away"):
+        controlled(drone, drone.given(handheld))
+
+
+def test_a_photograph_that_the_last_adjustment_loses_takes_its_measurements_along(
+    drone, handheld, monkeypatch
+):
+    """The others keep theirs."""
+    block, measure = drone.block(), OrientedBlock.measure
+
+    def measure_fewer(self, id):
+        point = measure(self, id)
+        of_rays = {one.name: getattr(point, one.name) for one in dataclasses.fields(point)}
+        del of_rays["position"]
+        return dataclasses.replace(point, **{n: x[point.image > 0] for n, x in of_rays.items()})
+
+    def adjust(network, **_):
+        monkeypatch.setattr(OrientedBlock, "measure", measure_fewer)
+        return block.adjustment, network, None
+
+    monkeypatch.setattr(georeferencing, "adjust_determined", adjust)
+    _, points, _ = controlled(drone, drone.given(handheld))
+    named = drone.named
+    for id, point in points.items():
+        images = {drone.images[i] for i, name in zip(named.image, named.name) if name == id}
+        assert {one.image for one in point.measurements} == images - {drone.images[0]}
+
+
+@pytest.mark.parametrize("id, removed, of_it", [
+    ("5", "point 5 in image a.jpg", True),
+    ("5", "either of point 4 in image a.jpg or point 5 in image b.jpg", True),
+    ("5", "Z of control point 5", True),
+    ("5", "point 5 b in image a.jpg", False),
+    ("5 b", "point 5 b in image a.jpg", True),
+    ("5", "Z of control point 5 b", False),
+    ("5", "distance 5–7", False),
+])  # fmt: skip
+def test_removed_observations_of_a_point(id, removed, of_it):
+    assert georeferencing._is_of_point(removed, id) == of_it
+
+
 def test_a_point_without_height_leaves_the_others_to_give_the_frame(drone, monkeypatch):
     """A free height of one point of nine, without satellite positions: the block gets to the truth
     by the others; with two that have heights it is refused, and these are counted."""
