@@ -15,11 +15,12 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from jaxbundle.adjustment.adjust import adjust
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.network.kinds import Ties
+from jaxbundle.network.kinds import ObservationTable, Ties
 from jaxbundle.network.subsets import keep_images, keep_points
 from jaxbundle.network.tables import Images, Network
 from jaxbundle.reconstruction.camera_priors import ASPECT, observed_parameters, with_observed
@@ -61,11 +62,9 @@ def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
     does not determine them."""
     network = _adjusted_network(result)
     network = release(network, [camera.id for camera in network.cameras])
-    number = np.arange(len(network.images))
     of_halves = []
-    # Every second photograph, so that both halves see the whole object.
-    for parity in (0, 1):
-        half_network = keep_images(network, number % 2 == parity)
+    for half in _halves(network.images.camera):
+        half_network = keep_images(network, half)
         rays = np.bincount(half_network.observations.point, minlength=len(half_network.points))
         half_network = keep_points(half_network, (rays > 1) | ~half_network.points.has_role("tie"))
         half_network = half_network.replace(datum_points=())
@@ -89,6 +88,15 @@ def replicated_ratios(result: Adjustment) -> dict[str, tuple[Ratio, Ratio]]:
     return {id: (of_halves[0][id], of_halves[1][id]) for id in in_both}
 
 
+def _halves(camera: Int[np.ndarray, " images"]) -> list[Bool[np.ndarray, " images"]]:
+    """Every second photograph of each camera, and the others: both see the whole object, and with
+    every camera."""
+    by_camera = np.argsort(camera, kind="stable")
+    is_second = np.zeros(len(camera), bool)
+    is_second[by_camera[1::2]] = True
+    return [~is_second, is_second]
+
+
 def is_replicated(ratio_a: Ratio, ratio_b: Ratio) -> bool:
     """Whether two halves confirm each other that a ratio is not 1."""
     # The difference of the halves shows the correlated errors that their σ does not contain.
@@ -105,23 +113,29 @@ def release(network: Network, cameras: Collection[str]) -> Network:
     observed = observed_parameters(network)
     if observed is None:
         return network
-    keep = [
-        name != ASPECT or id not in cameras for id, name in zip(observed.camera, observed.parameter)
-    ]
+    names = [*zip(observed.camera, observed.parameter)]
+    rows = [k for k, (id, name) in enumerate(names) if name != ASPECT or id not in cameras]
+    ids = [observed.camera[k] for k in rows]
+    further: list[ObservationTable] = []
     # Of a lens in portrait format fy lies along the other axis: fx of both are then two unknowns.
-    network = with_observed(network, observed.take(np.array(keep)))
-    return network.replace(
-        further=tuple(
-            _without_focal_lengths(kind, cameras) if isinstance(kind, Ties) else kind
-            for kind in network.further
-        )
-    )
+    for kind in network.further:
+        if isinstance(kind, Ties):
+            is_parted = _ties_focal_lengths(kind, cameras)
+            for first, other in zip(kind.take(is_parted).camera, kind.take(is_parted).other):
+                # What was observed of the first alone (`camera_priors`) is now observed of each.
+                if (first, "fx") in names and (other, "fx") not in names:
+                    rows, ids = [*rows, names.index((first, "fx"))], [*ids, other]
+            kind = kind.take(~is_parted)
+        further.append(kind)
+    observed = dataclasses.replace(observed.take(np.array(rows, int)), camera=tuple(ids))
+    return with_observed(network.replace(further=tuple(further)), observed)
 
 
-def _without_focal_lengths(ties: Ties, cameras: Collection[str]) -> Ties:
+def _ties_focal_lengths(ties: Ties, cameras: Collection[str]) -> Bool[np.ndarray, " ties"]:
+    """Which rows make fx of one of these cameras equal to that of another."""
     columns = zip(ties.camera, ties.other, ties.parameter)
-    keep = [name != "fx" or not {camera, partner} & {*cameras} for camera, partner, name in columns]
-    return ties.take(np.array(keep))
+    is_parted = [name == "fx" and not {*cameras}.isdisjoint(pair) for *pair, name in columns]
+    return np.array(is_parted, bool)
 
 
 def _adjusted_network(result: Adjustment) -> Network:

@@ -10,6 +10,7 @@ import jaxbundle
 from jaxbundle.network.build import make_further
 from jaxbundle.reconstruction.square_pixels import (
     Ratio,
+    _halves,
     contradicted_ratios,
     is_replicated,
     release,
@@ -101,6 +102,16 @@ def test_only_the_focal_lengths_of_released_cameras_are_no_longer_one_unknown():
     ties, parameters = tables["ties"], tables["camera_parameters"]
     assert [*zip(ties.camera, ties.other, ties.parameter)] == given[1:]
     assert list(parameters.camera) == ["b"]
+
+
+@pytest.mark.parametrize("camera", [[0, 1] * 6, [0] * 7 + [1] * 5, [0, 1, 2, 2, 1, 0] * 2])
+def test_every_camera_is_in_both_halves(camera):
+    """Also cameras that alternate in the order of the files."""
+    halves = _halves(np.array(camera))
+    np.testing.assert_array_equal(halves[0], ~halves[1])
+    for c in set(camera):
+        in_halves = [int((half & (np.array(camera) == c)).sum()) for half in halves]
+        assert abs(in_halves[0] - in_halves[1]) <= 1
 
 
 @pytest.mark.parametrize("one, other, confirmed", [

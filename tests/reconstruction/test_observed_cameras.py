@@ -76,6 +76,8 @@ def test_pixels_that_are_not_square_separate_the_focal_lengths_of_both_formats()
     (ties,) = (one for one in made.further if one.TABLE == "ties")
     assert set(ties.parameter) == {"k1", "k2", "k3"}
     assert ("a", "fy/fx") not in rows(made) and ("b", "fy/fx") in rows(made)
+    # Each is now an unknown of its own, of which the file states the same.
+    assert rows(made)["a", "fx"] == rows(made)["b", "fx"] == (FILE.value, FILE.sigma)
 
 
 def test_another_principal_distance_changes_only_that_of_unknown_cameras():
