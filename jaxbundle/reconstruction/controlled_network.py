@@ -2,6 +2,7 @@
 measurements, and satellite positions with an offset on the axes that control has."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from jaxbundle.network.kinds import Antennas, ExteriorPriors
 from jaxbundle.network.subsets import keep_points
 from jaxbundle.network.tables import GREY, Distances, LeftOut, Network, Points, Source
 from jaxbundle.network.units import from_image_unit
+from jaxbundle.orientation.missing import note_missing
 from jaxbundle.reconstruction.control_choice import ControlChoice
 from jaxbundle.reconstruction.oriented_block import MeasuredPoint, OrientedBlock
 
@@ -56,7 +58,7 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         if control_points.role[k] != "check"
     }
     has_both_ends = np.array([a in row and b in row for a, b in ends], bool)
-    return network.replace(
+    controlled = network.replace(
         images=dataclasses.replace(images, position=block.X0, angles=block.angles),
         points=Points(
             (*network.points.id, *control_points.id),
@@ -90,11 +92,9 @@ def network_with_control(block: OrientedBlock, control: Points, choice: ControlC
         datum_points=(),
         object_unit="m",
         warnings=block_network.warnings,
-        notes=tuple(
-            note for note in block_network.notes if not says_left_out(note, control_points.id)
-        ),
-        left_out=without_names(network.left_out, control_points.id),
+        notes=block_network.notes,
     )
+    return without_returned(controlled, control_points.id)
 
 
 def _colours_with_added(points: Points, number: int) -> UInt8[np.ndarray, "n 3"] | None:
@@ -104,9 +104,26 @@ def _colours_with_added(points: Points, number: int) -> UInt8[np.ndarray, "n 3"]
     return np.concatenate([points.colour, np.full((number, 3), GREY, np.uint8)])
 
 
-def says_left_out(note: str, ids: tuple[str, ...]) -> bool:
-    """Whether a note says that points were left out that come back: its last words are names."""
-    return note.startswith("left out ") and any(f" {id} " in f"{note} " for id in ids)
+def without_returned(network: Network, ids: tuple[str, ...]) -> Network:
+    """The network with notes of what is left out although these points come back."""
+    # Points without start values are a note with the reason of each (`note_missing`), which is
+    # written again for the others.
+    missing = [one for one in network.left_out if one.thing == "point" and ": " in one.why]
+    for clause in {one.why.partition(": ")[0] for one in missing if {*one.names} & {*ids}}:
+        of_clause = [one for one in missing if one.why.startswith(f"{clause}: ")]
+        reasons = {
+            name: one.why.removeprefix(f"{clause}: ")
+            for one in of_clause
+            for name in one.names
+            if name not in ids
+        }
+        said = re.compile(rf"left out \d+ points? {re.escape(clause)}: ")
+        network = network.replace(
+            notes=tuple(note for note in network.notes if not said.match(note)),
+            left_out=tuple(one for one in network.left_out if one not in of_clause),
+        )
+        network = note_missing(network, "point", reasons, clause)
+    return network.replace(left_out=without_names(network.left_out, ids))
 
 
 def without_names(notes: Sequence[LeftOut], ids: tuple[str, ...]) -> tuple[LeftOut, ...]:

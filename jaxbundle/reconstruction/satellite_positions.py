@@ -8,6 +8,11 @@ from jaxbundle.photographs.places import MapPositions, map_positions
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.photographs import Photograph
 
+# Of positions that are too near each other for a direction and a scale (`map_positions`).
+NARROW = (
+    "satellite positions of the photographs extend over less than 8 σ: they do not define the frame"
+)
+
 
 def find_positions(
     photographs: Sequence[Photograph], control: Control | None
@@ -24,10 +29,7 @@ def find_positions(
                 "three or more with heights"
             ] * bool(number_with_position)
         if not positions.define_frame:
-            return positions, [
-                "satellite positions of the photographs extend over less than 8 σ: they "
-                "do not define the frame"
-            ]
+            return positions, [NARROW]
         return positions, [f"satellite positions of the photographs: {positions.words}"]
     notes = [f"control in {control.system or 'a system that its file does not name'}"]
     if not number_with_position:
@@ -54,6 +56,8 @@ def find_positions(
                 f"{distance / 1000:.0f} km from control in {positions.system}; name the "
                 "system of control in the first line of gcp_list.txt",
             ]
+    # They stay observations, but control alone gives the frame.
+    notes += [] if positions.define_frame else [NARROW]
     return positions, [
         *notes,
         f"satellite positions of {int(np.isfinite(positions.X[:, 0]).sum())} "

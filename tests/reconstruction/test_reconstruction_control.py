@@ -12,11 +12,12 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import select_checks
 from jaxbundle.measure.coded_targets import NamedPoints
 from jaxbundle.network.tables import LeftOut
+from jaxbundle.orientation.missing import note_missing
 from jaxbundle.photographs.exif import GeographicPosition
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.reconstruction import named
 from jaxbundle.reconstruction.control import read_control_measurements, with_sigma
-from jaxbundle.reconstruction.controlled_network import says_left_out, without_names
+from jaxbundle.reconstruction.controlled_network import without_names, without_returned
 from jaxbundle.reconstruction.named import (
     NamedMeasurements,
     find_named,
@@ -246,6 +247,10 @@ def test_what_is_done_with_positions_is_said(tmp_path):
     )
     found, notes = find_positions(photographs, near)
     assert found is not None and "satellite positions of 6 photographs with their σ" in notes[-1]
+    assert "frame" not in " ".join(notes)
+    place = dataclasses.replace(PLACES[0], height=100.0)
+    found, notes = find_positions([SimpleNamespace(exif=SimpleNamespace(place=place))] * 6, near)
+    assert found is not None and "do not define the frame" in " ".join(notes)
     nothing = [SimpleNamespace(exif=SimpleNamespace(place=None))] * 4
     found, notes = find_positions(nothing, near)
     assert found is None and "no satellite positions in the photographs" in notes[-1]
@@ -267,6 +272,15 @@ def test_control_that_comes_back_is_not_said_to_be_left_out():
     )
     found = without_names(notes, ("gcp00",))
     assert [one.names for one in found] == [("17",), ("gcp00 in a.jpg",)]
-    text = "left out 1 point for which no start values were found: gcp00 (seen in 1 placed image)"
-    assert says_left_out(text, ("gcp00",)) and not says_left_out(text, ("gcp0", "seen in"))
-    assert not says_left_out("gcp00 is at the place of gcp01", ("gcp00",))
+    network = read_network(EXAMPLES / "bingo_indoor").replace(notes=(), left_out=())
+    network = network.note("gcp00 is at the place of gcp01")
+    few, clause = "seen in 1 placed image; 2 are needed", "for which no start values were found"
+    reasons = {"gcp00": few, "17": few, "18": "its 2 rays do not intersect"}
+    noted = note_missing(network, "point", reasons, clause)
+    # What is said of the others stays: the same as if the point had never been missing.
+    others = {id: why for id, why in reasons.items() if id != "gcp00"}
+    expected = note_missing(network, "point", others, clause)
+    found = without_returned(noted, ("gcp00",))
+    assert (found.notes, found.left_out) == (expected.notes, expected.left_out)
+    assert without_returned(noted, ("gcp0",)).notes == noted.notes
+    assert without_returned(noted, tuple(reasons)).notes == network.notes
