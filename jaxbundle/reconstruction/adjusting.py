@@ -85,13 +85,14 @@ class WeightingSettings:
 @dataclasses.dataclass(frozen=True)
 class WeightedAdjustment:
     """The adjustment, and the factor of σ of each class of measurements, which the adjustment has
-    as its `sigma_factors`; the number of measurements that agree with it, and `unused_points` of
-    two rays."""
+    as its `sigma_factors`; the number of measurements that agree with it, `unused_points` of two
+    rays, and `unused_features`, positions that took no part (`leave_out_features`)."""
 
     adjustment: Adjustment
     factors: dict[str, float]
     agreeing_rays: int
     unused_points: int = 0
+    unused_features: int = 0
 
     @property
     def worst(self) -> float:
@@ -100,7 +101,7 @@ class WeightedAdjustment:
 
     def __post_init__(self) -> None:
         # σ estimated from the residuals are not confirmed by them: no χ² test, neither of this
-        # adjustment nor of that to control which takes its place (`control.py`)
+        # adjustment nor of that with control, which takes its place (`georeferencing`)
         if self.adjustment.converged:
             factors = {f"image points {name}": f for name, f in self.factors.items()}
             changed = self.adjustment.with_changes(sigma_factors=factors)
@@ -300,7 +301,7 @@ def _weight(
         suspects = _pairs_of_ids(result, np.any(beyond, axis=1))
         # Once: a datum that changes with each round would change all σ, too.
         network = network.replace(datum_points=choose_datum_points(result))
-    for _ in range(settings.max_rounds):
+    for rounds_left in reversed(range(settings.max_rounds)):
         tell("data snooping")
         weighted = dataclasses.replace(network.observations, sigma=sigma * factor_so_far[:, None])
         result, network, is_kept = adjust_determined(
@@ -319,7 +320,8 @@ def _weight(
         rows = _rows(result, network)
         # Gross errors are removed by now: no limit.
         factor = _factors(*_redundancy(result), measurement_class[rows], settings, np.inf)
-        if np.all(np.abs(factor - 1) < settings.last_change):
+        # The result is that with the last factors.
+        if not rounds_left or np.all(np.abs(factor - 1) < settings.last_change):
             break
         factor_so_far[rows] *= factor
         suspects = _pairs_of_ids(result, ~result.problem.used)
@@ -395,6 +397,7 @@ def _factors(
         scale = NORMAL_SIGMA_BY_MAD * np.median(normalised_residual[checked])
         # The choice of good ones and the factor depend on each other; five rounds settle both.
         for _ in range(5):
+            # Exact data have a scale of 0, below which there would be no good ones.
             good = checked & (normalised_residual < gross * max(scale, 1e-9))
             scale = np.sqrt(np.sum(v[rows][good] ** 2) / np.sum(redundancy[good]))
         factor[rows] = np.clip(scale, settings.min_factor, settings.max_factor)

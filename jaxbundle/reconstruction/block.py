@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.network.kinds import Antennas
@@ -36,7 +36,7 @@ class CameraPositions:
     def contradictions(self, prior: Sequence[float], unit: str) -> list[str]:
         """How the positions contradict control and their own σ, in words; `prior`: σ of the
         offset before the adjustment."""
-        sentences, limit = [], 3.0  # σ: by chance one in 370, for each of six figures
+        sentences, limit = [], 3.0  # σ: by chance one in 370 for an offset, less for an RMS
         for axis, value, s in zip("XYZ", self.offset, prior):
             if np.isfinite(value) and abs(value) > limit * s:
                 sentences.append(
@@ -169,20 +169,9 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
     """The facts of an adjusted block.
 
     **Arguments:** `exif` by photograph; `system` of the coordinates, empty: arbitrary."""
-    network, values = result.problem.network, result.image_values
-    X0, M = values[:, :3], np.asarray(batched.matrices(values[:, 3:]))
-    is_used = result.problem.used
-    image, point = result.problem.image[is_used], result.problem.point[is_used]
-    X = result.point_values
-    is_known = np.isfinite(X[point]).all(1)
-    image, point = image[is_known], point[is_known]
-    depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
-    # By photograph first: one with many points does not decide for all.
-    of_image = np.array(
-        [np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(len(X0))]
-    )
-    c = np.array([central_distance(camera) for camera in network.cameras])
-    pixel = 1 / c[network.images.camera]
+    network, X = result.problem.network, result.point_values
+    X0, M = _orientations(result)
+    image, point = _used_rays(result)
     # Within 45 degrees of the vertical: in an oblique block the middle of a photograph is not below
     # the camera, and footprints reach to the horizon.
     looks_down = bool(system) and float(np.median(M[:, 2, 2])) > 0.7
@@ -213,8 +202,8 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
             else "arbitrary: neither control, satellite positions nor scale bars"
         ),
         network.object_unit,
-        float(np.nanmedian(of_image * pixel)),
-        float(np.nanmedian(of_image)),
+        ground_sample_distance(result),
+        float(np.nanmedian(_object_distances(result))),
         height,
         area,
         on_ties.sum() / max(len(ground), 1),
@@ -222,6 +211,42 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
         places,
         camera_positions(result),
     )
+
+
+def ground_sample_distance(result: Adjustment) -> float:
+    """The length of a pixel of the adjusted cameras at the points, the median of the
+    photographs."""
+    network = result.problem.network
+    cameras = (
+        dataclasses.replace(c, parameters=result.camera_parameters(c.id)) for c in network.cameras
+    )
+    c = np.array([central_distance(camera) for camera in cameras])
+    return float(np.nanmedian(_object_distances(result) / c[network.images.camera]))
+
+
+def _object_distances(result: Adjustment) -> Float[np.ndarray, " images"]:
+    """The median depth of the points of every photograph; NaN without points."""
+    X, (X0, M), (image, point) = result.point_values, _orientations(result), _used_rays(result)
+    depth = -np.einsum("nj,nj->n", M[image, 2], X[point] - X0[image])
+    # By photograph first: one with many points does not decide for all.
+    return np.array(
+        [np.median(depth[image == k]) if (image == k).any() else np.nan for k in range(len(X0))]
+    )
+
+
+def _orientations(
+    result: Adjustment,
+) -> tuple[Float[np.ndarray, "images 3"], Float[np.ndarray, "images 3 3"]]:
+    """Projection centres and rotation matrices."""
+    values = result.image_values
+    return values[:, :3], np.asarray(batched.matrices(values[:, 3:]))
+
+
+def _used_rays(result: Adjustment) -> tuple[Int[np.ndarray, " rays"], Int[np.ndarray, " rays"]]:
+    """Image and point of the measurements that take part, of points with a position."""
+    problem = result.problem
+    is_used = problem.used & np.isfinite(result.point_values[problem.point]).all(1)
+    return problem.image[is_used], problem.point[is_used]
 
 
 def _inner(xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:

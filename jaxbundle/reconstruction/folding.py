@@ -43,7 +43,8 @@ class SuperpositionSettings:
     every second one is found again in a right pair, fewer than five are found with a probability of
     2e-10."""
     min_of_each: int = 10
-    """Minimum expected points of each photograph in the other one."""
+    """Minimum expected points of each photograph in the other one: a tenth of them is one; if every
+    second one is found again in a right pair, none is found with a probability of 1e-3."""
     min_shared: float = 0.1
     """Share of the expected points below which a pair is contradictory. Superimposed parts that
     repeat themselves share some points; right pairs share most, blurred ones less."""
@@ -61,11 +62,12 @@ def refuse_folded(
     names: Sequence[str],
     settings: SuperpositionSettings = SuperpositionSettings(),
 ) -> None:
-    """Refuse a result that disagrees with most measurements in its photographs."""
+    """Refuse a result that disagrees with most measurements in its photographs, of those that
+    could take part."""
     placed = set(weighted.adjustment.network.images.id)
     rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
     rays = np.bincount(measured.track[rows])
-    number = int(rays[rays > 1].sum())
+    number = int(rays[rays > 1].sum()) - weighted.unused_features
     if weighted.agreeing_rays < settings.min_agreeing * number:
         raise _folded(
             f"only {weighted.agreeing_rays} of {number} measurements in "

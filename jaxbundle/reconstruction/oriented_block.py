@@ -23,6 +23,7 @@ from jaxbundle.orientation import batched
 from jaxbundle.orientation.alignment import similarity_of_most
 from jaxbundle.orientation.control_consistency import Discrepancies
 from jaxbundle.orientation.rays import MIN_COSINE, rays_of
+from jaxbundle.reconstruction.block import ground_sample_distance
 from jaxbundle.reconstruction.named import NamedMeasurements
 
 # Minimum control points of a block without satellite positions: a similarity has 7 parameters, two
@@ -269,14 +270,17 @@ class OrientedBlock:
 
     @property
     def ground_sample_distance(self) -> float:
-        """The length of a pixel at the named points, the median."""
+        """The length of a pixel at the named points, the median; at all points if no named one
+        has a position."""
         lengths = [
             self.pixel_length(self.measure(id), self.X[k])
             for id, k in self.row_of_determined.items()
         ]
         # NaN of measurements outside the range of their camera
         known_lengths = [x for of_point in lengths for x in of_point if np.isfinite(x)]
-        return float(np.median(known_lengths)) if known_lengths else 1.0
+        if known_lengths:
+            return float(np.median(known_lengths))
+        return ground_sample_distance(self.result) * float(np.cbrt(np.linalg.det(self.A)))
 
     def compare(self, places: Sequence[int], points: Points) -> Discrepancies:
         """Coordinates from the block minus given ones, and their joint covariance."""

@@ -103,8 +103,8 @@ def reconstruct(
     **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, shared by
     all; `store`: folder for features and matches; `progress(stage, done, total)`;
     `control`: points with coordinates, by the names of coded targets or measured in photographs;
-    `distances`: rows `from`, `to`, `value`, `sigma` between named points; `name` of the result,
-    default: of the first folder.
+    `distances`: rows `from`, `to`, `value`, `sigma` between named points, metres; `name` of the
+    result, default: of the first folder.
 
     **Raises:** `InputError` if the photographs cannot be used; `NotSolvedError` if no two of
     them can be oriented.
@@ -113,7 +113,7 @@ def reconstruct(
     photographs, left_out = find_photographs(given)
     cameras = assign_cameras(photographs, camera, settings.camera_per_folder)
     named_measurements, discs, notes = find_named(
-        photographs, settings.targets, control, settings.workers, settings.uncoded
+        photographs, settings.targets, control, settings.workers or None, settings.uncoded
     )
     notes += name_other_files(given)
     positions, messages = find_positions(photographs, control)
@@ -144,6 +144,8 @@ def reconstruct(
         attitudes,
     )
     system = "" if control is None else control.system
+    # Control whose file names no system is in that of the positions: `find_positions` has dropped
+    # positions far from it.
     if positions is not None and (framed or control is not None):
         system = positions.words if control is None else system or positions.system
     first_source = Path(given[0])
@@ -257,8 +259,11 @@ class _ReconstructionRun:
         """Named points as features and matches."""
         named_measurements, min_common = self.further.named, self.settings.min_common_targets
         features = named_as_features(named_measurements, len(self.names))
-        for name, of_photograph in zip(self.names, features):
+        for photograph, name, of_photograph in zip(self.photographs, self.names, features):
             if (number := len(of_photograph)) < min_common:
+                # Of a damaged photograph this is the reason, not that it has no targets.
+                if number == 0 and name not in self.left_out:
+                    self._make_reader(photograph)()
                 self.left_out.setdefault(
                     name, f"{count(number, 'coded target')}, at least {min_common} are needed"
                 )
@@ -374,14 +379,26 @@ class _ReconstructionRun:
                         self.names[k], why_alone(k, self.names, matches, pairs)
                     )
                 continue
+            notes_before = len(self.notes)
             try:
                 part, reasons = self._make_part(group, features, pairs, f"part {len(parts) + 1}")
             except (InputError, NotSolvedError) as error:
                 failures.append(str(error))
+                # The next part gets the name.
+                del self.notes[notes_before:]
+                why = str(error).removeprefix("not solved: ")
                 for k in group:
-                    self.left_out.setdefault(self.names[k], "its part could not be oriented")
+                    self.left_out.setdefault(
+                        self.names[k], f"its part could not be oriented: {why}"
+                    )
                 continue
             parts.append(part)
+            placed = set(part.adjustment.network.images.id)
+            reasons = {
+                self.names[k]: "none of its tie points is used"
+                for k in group
+                if self.names[k] not in placed
+            } | reasons
             remaining = [k for k in group if self.names[k] in reasons]
             renumbered = [
                 dataclasses.replace(
@@ -399,7 +416,27 @@ class _ReconstructionRun:
                     self.left_out |= {self.names[k]: reasons[self.names[k]] for k in next_group}
         if not parts:
             raise NotSolvedError(self._explain_failure(pairs, failures), self.names)
-        return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
+        return self._in_order(parts)
+
+    def _in_order(self, parts: Sequence[ReconstructedPart]) -> list[ReconstructedPart]:
+        """The parts, the largest first, and named in this order, in notes and warnings, too: of
+        the photographs of a larger group fewer may be left."""
+        ordered = sorted(parts, key=lambda part: -len(part.adjustment.network.images))
+        names = {part.name: f"part {number}" for number, part in enumerate(ordered, 1)}
+
+        def rename(text: str) -> str:
+            name, colon, sentence = text.partition(":")
+            return names.get(name, name) + colon + sentence
+
+        self.notes = [rename(note) for note in self.notes]
+        self.warnings = [(weight, rename(warning)) for weight, warning in self.warnings]
+        for k, part in enumerate(ordered):
+            if part.name != names[part.name]:
+                adjustment = part.adjustment.with_changes()
+                name = self._network_name(names[part.name])
+                adjustment.network = adjustment.network.replace(name=name)
+                ordered[k] = dataclasses.replace(part, name=names[part.name], adjustment=adjustment)
+        return ordered
 
     def _warn(self, message: str, weight: float = 1.0) -> None:
         """Keep a warning; those of larger weight are shown first."""
@@ -458,14 +495,16 @@ class _ReconstructionRun:
         settings = self.settings
         pairs_inside = [p for p in pairs if set(p.images) <= set(group)]
         measured = self._measure(features, pairs_inside)
-        network = self._make_network(name, measured, self.further)
+        network = self._make_network(name, group, measured, self.further)
         self._begin("start values")
         pair_of_names = {
             (self.names[p.images[0]], self.names[p.images[1]]): p for p in pairs_inside
         }
         oriented, weighted, note = self._adjust_first(network, measured, pair_of_names)
         if self.discs is not None:
-            oriented, weighted, note = self._complete(name, weighted, measured, pair_of_names)
+            oriented, weighted, note = self._complete(
+                name, group, weighted, measured, pair_of_names
+            )
         weighted, note = self._check_ratios(oriented, weighted, measured, note)
         self._begin("")
         # Before control, which fits a folded part as well as it can.
@@ -510,7 +549,7 @@ class _ReconstructionRun:
         absolute = control is not None or self.further.positions is not None
         block = describe_block(result, exif, self.system if absolute else "")
         part = ReconstructedPart(name, result, weighted.factors, block, control, no_control)
-        if not (absolute or self.further.distances):
+        if not (absolute or len(result.network.distances)):
             remedy = (
                 "control could not be used"
                 if no_control
@@ -523,24 +562,29 @@ class _ReconstructionRun:
         return part
 
     def _make_network(
-        self, part: str, measured: Measurements, further_data: FurtherData
+        self, part: str, group: Sequence[int], measured: Measurements, further_data: FurtherData
     ) -> Network:
-        """The network of a part, without start values. Its name is that of the job, from the second
-        part on with the part's own."""
-        is_first = part in ("", "part 1") and self.title
+        """The network of a group of photographs, without start values."""
+        named = further_data.named
         return photograph_network(
             self.photographs,
             self.cameras,
             measured,
-            further_data,
-            self.title if is_first else ", ".join(filter(None, (self.title, part))),
+            dataclasses.replace(further_data, named=named.take(np.isin(named.image, group))),
+            self._network_name(part),
             self.settings.aspect_sigma,
             self.settings.angle_unit,
         )
 
+    def _network_name(self, part: str) -> str:
+        """The name of the job, from the second part on with the part's own."""
+        is_first = part in ("", "part 1") and self.title
+        return self.title if is_first else ", ".join(filter(None, (self.title, part)))
+
     def _complete(
         self,
         name: str,
+        group: Sequence[int],
         weighted: WeightedAdjustment,
         measured: Measurements,
         pairs: NamedPairs,
@@ -558,7 +602,7 @@ class _ReconstructionRun:
         extra = dataclasses.replace(
             self.further, named=join_named(self.further.named, uncoded_names)
         )
-        network = self._make_network(name, measured, extra)
+        network = self._make_network(name, group, measured, extra)
         return self._adjust_first(network, measured, pairs)
 
     def _compare_with_files(self, result: Adjustment) -> list[str]:
@@ -589,13 +633,13 @@ class _ReconstructionRun:
     ) -> tuple[Oriented, WeightedAdjustment, str]:
         """The first start values that lead to an adjustment, the adjustment, and a note on
         attitudes."""
-        guessed = [
-            camera.id
-            for camera, stated_distance in zip(self.cameras.cameras, self.cameras.stated_distances)
-            if stated_distance is None and not self.cameras.calibrated
-        ]
+        stated = self._stated_distances()
+        guessed = [camera.id for camera in self.cameras.cameras if camera.id not in stated]
         first_error: NotSolvedError | None = None
         settings = self.settings.start_values
+        if not self.settings.natural_points:
+            # The codes say which targets are the same: what a pair needs is enough.
+            settings = dataclasses.replace(settings, min_rays=self.settings.min_common_targets)
         for oriented in start_values(network, guessed, pairs, settings):
             try:
                 weighted, note = self._adjust(oriented, measured)
@@ -603,7 +647,7 @@ class _ReconstructionRun:
                 first_error = first_error or error
                 continue
             result = weighted.adjustment
-            if not is_plausible(result, guessed, settings):
+            if not is_plausible(result, stated, settings):
                 first_error = first_error or _not_solved(result)
                 continue
             # Once more with the adjusted camera, if that orients more photographs.
@@ -613,11 +657,18 @@ class _ReconstructionRun:
                     better, other_note = self._adjust(restarted, measured)
                 except NotSolvedError:
                     return oriented, weighted, note
-                if is_plausible(better.adjustment, guessed, settings):
+                if is_plausible(better.adjustment, stated, settings):
                     return restarted, better, other_note
             return oriented, weighted, note
         assert first_error is not None, "start values are there, or an error says why not"
         raise first_error
+
+    def _stated_distances(self) -> dict[str, float]:
+        """The principal distances that files or a calibration state, by camera."""
+        if self.cameras.calibrated:
+            return {c.id: c.parameters.get("fx", np.nan) for c in self.cameras.cameras}
+        of_files = zip(self.cameras.cameras, self.cameras.stated_distances)
+        return {camera.id: stated.value for camera, stated in of_files if stated is not None}
 
     def _check_ratios(
         self, oriented: Oriented, weighted: WeightedAdjustment, measured: Measurements, note: str
@@ -630,6 +681,7 @@ class _ReconstructionRun:
         self._begin("ratio of the focal lengths")
         halves = square_pixels.replicated_ratios(weighted.adjustment)
         released = {}
+        as_square = f"the pixels are taken as square (fy/fx 1 ± {self.settings.aspect_sigma:g})"
         for id, ratio in contradicted.items():
             ratios_of_halves = halves.get(id)
             message = f"camera {id!r}: the photographs alone give fy/fx {_ratio_in_words(ratio)}, "
@@ -640,18 +692,27 @@ class _ReconstructionRun:
                     f"halves of them {' and '.join(map(_ratio_in_words, ratios_of_halves))}: "
                 )
             if ratios_of_halves is not None and square_pixels.is_replicated(*ratios_of_halves):
-                released[id] = ratio
-                self.notes.append(f"{message}the pixels are not square")
+                released[id] = message
             else:
-                self.notes.append(
-                    f"{message}not confirmed, the pixels are taken as square (fy/fx "
-                    f"1 ± {self.settings.aspect_sigma:g})"
-                )
+                self.notes.append(f"{message}not confirmed, {as_square}")
         if not released:
             return weighted, note
         # From the start values: the result's gross errors were judged with square pixels.
         network = square_pixels.release(oriented.network, released)
-        return self._adjust(dataclasses.replace(oriented, network=network), measured)
+        oriented = dataclasses.replace(oriented, network=network)
+        try:
+            better, other_note = self._adjust(oriented, measured)
+            if not is_plausible(
+                better.adjustment, self._stated_distances(), self.settings.start_values
+            ):
+                raise _not_solved(better.adjustment)
+        except NotSolvedError:
+            self.notes += [
+                f"{words}but not solved with it, {as_square}" for words in released.values()
+            ]
+            return weighted, note
+        self.notes += [f"{words}the pixels are not square" for words in released.values()]
+        return better, other_note
 
     def _adjust(self, oriented: Oriented, measured: Measurements) -> tuple[WeightedAdjustment, str]:
         """The adjustment from start values, and a note on attitudes."""
@@ -662,7 +723,8 @@ class _ReconstructionRun:
         weighted = adjust_weighted(
             placed, classes[is_kept], class_names, significance, self._begin, weighting
         )
-        return weighted, note
+        unused = int((~is_kept).sum())
+        return dataclasses.replace(weighted, unused_features=unused), note
 
 
 def _ratio_in_words(ratio: square_pixels.Ratio) -> str:

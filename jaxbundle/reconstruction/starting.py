@@ -59,7 +59,8 @@ class BlockStartSettings:
     views 30 degrees apart then change by 1.5 degrees."""
     min_rays: int = 12
     """Minimum image points of a photograph that other photographs share: 24 coordinates for 6
-    unknowns. Of fewer most may be gross errors."""
+    unknowns. Of fewer most may be gross errors. Of coded targets alone
+    `ReconstructionSettings.min_common_targets` are enough."""
     min_oriented: float = 0.5
     """Minimum share of photographs oriented by start values with another principal distance."""
     max_others: int = 1
@@ -175,16 +176,16 @@ def _with_distances(network: Network, distances: Mapping[str, float]) -> Network
 
 def is_plausible(
     result: Adjustment,
-    guessed: Sequence[str] = (),
+    stated: Mapping[str, float],
     settings: BlockStartSettings = BlockStartSettings(),
 ) -> bool:
     """Whether an adjustment converged to plausible principal distances.
 
-    **Arguments:** `guessed`: ids of cameras with a principal distance unknown from files."""
+    **Arguments:** `stated`: those of files or a calibration, by camera."""
     low, high, ratio = settings.min_distance, settings.max_distance, settings.stated_ratio
 
     def as_stated(camera: Camera, f: float) -> bool:
-        return camera.id not in guessed and 1 / ratio < f / camera.parameters["fx"] < ratio
+        return camera.id in stated and 1 / ratio < f / stated[camera.id] < ratio
 
     return bool(result.converged) and all(
         low < adjusted["fx"] / max(camera.image_size) < high or as_stated(camera, adjusted["fx"])

@@ -104,10 +104,11 @@ def test_of_two_results_the_one_that_fits_better_counts(monkeypatch, worst):
 
 @pytest.mark.parametrize("last, changes, expected", [
     (True, [1.5, 2.0, 1.2, 1.001, 9.0], 1.5 * 2.0 * 1.2), (False, [1.5, 2.0], 1.5),
+    (True, [1.5, 2.0, 2.0, 2.0, 2.0], 1.5 * 2.0**3),
 ])  # fmt: skip
 def test_sigma_are_multiplied_until_they_fit(monkeypatch, last, changes, expected):
-    """Round by round until the factor is 1; residuals of an adjustment without a minimum are none,
-    and change nothing."""
+    """Round by round until the factor is 1, four rounds at most; residuals of an adjustment without
+    a minimum are none, and change nothing."""
     camera = Camera("cam", "brown", {"c": 24.0}, free=("c",))
     network = simulate(ring_of_stations(4, 2.5, 6.0), grid_of_targets(4, 4, 0.5), camera, noise=0.0)
     every = np.arange(len(network.observations))

@@ -115,16 +115,18 @@ def test_the_pair_with_most_expected_points_is_named_first(monkeypatch):
         assert f"0 of {number} points expected in both {one} and {other} were found" in words
 
 
-@pytest.mark.parametrize("agreeing, refused", [(11, True), (13, False)])
-def test_a_result_that_most_measurements_contradict_is_refused(agreeing, refused):
+@pytest.mark.parametrize("agreeing, unused, refused", [
+    (11, 0, True), (13, 0, False), (11, 3, False),
+])  # fmt: skip
+def test_a_result_that_most_measurements_contradict_is_refused(agreeing, unused, refused):
     """A third of those of points with two rays in its photographs, 36: another photograph has more,
-    and some points are seen once."""
+    and some points are seen once. Positions of features that were left out cannot agree."""
     image = np.repeat([0, 1, 2], [18, 20, 90])
     track = np.concatenate([np.arange(18), np.arange(20), np.arange(90)])
     measured = SimpleNamespace(image=image, track=track)
     network = SimpleNamespace(images=SimpleNamespace(id=("a.jpg", "b.jpg")))
     weighted = SimpleNamespace(
-        adjustment=SimpleNamespace(network=network), agreeing_rays=agreeing
+        adjustment=SimpleNamespace(network=network), agreeing_rays=agreeing, unused_features=unused
     )
     names = ["a.jpg", "b.jpg", "c.jpg"]
     error = pytest.raises(NotSolvedError, match="only 11 of 36 measurements in 2 photographs")

@@ -1,5 +1,6 @@
 """Rays of named points in an adjusted block, compared with exact projections."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 from jaxbundle import Camera
 from jaxbundle.cameras import get_model, project
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.reconstruction.block import ground_sample_distance
 from jaxbundle.reconstruction.named import NamedMeasurements
 from jaxbundle.reconstruction.oriented_block import FrameData, OrientedBlock
 from jaxbundle.tiepoints.verified_pairs import central_distance
@@ -24,14 +26,19 @@ AXES = np.concatenate([np.eye(2), -np.eye(2)])
 
 
 def block_of(camera, xy, X):
-    """A block of one photograph, with one point p at X, measured several times."""
+    """A block of one photograph, with one point p at X, measured several times; the adjustment
+    began with another principal distance."""
     images = SimpleNamespace(id=("i",), camera=np.zeros(1, int), sigma=np.full((1, 6), np.nan))
-    network = SimpleNamespace(images=images, cameras=(camera,), points=SimpleNamespace(id=("p",)))
+    start = dataclasses.replace(camera, parameters=camera.parameters | {"fx": 0.85 * F})
+    network = SimpleNamespace(images=images, cameras=(start,), points=SimpleNamespace(id=("p",)))
+    n = len(xy)
+    problem = SimpleNamespace(
+        network=network, used=np.ones(n, bool), image=np.zeros(n, int), point=np.zeros(n, int)
+    )
     result = SimpleNamespace(
-        problem=SimpleNamespace(network=network), point_values=X[None],
+        problem=problem, point_values=X[None],
         image_values=np.append(X0, ANGLES)[None], camera_parameters=lambda id: camera.parameters,
     )  # fmt: skip
-    n = len(xy)
     named = NamedMeasurements(np.zeros(n, int), ("p",) * n, np.asarray(xy), np.ones((n, 2)))
     return OrientedBlock(result, FrameData(SimpleNamespace(id=("p",)), named, ("i",)))
 
@@ -71,6 +78,10 @@ def test_the_ground_sample_distance_is_that_of_the_depth():
     for away in (0.0, 0.7):
         X = X0 + M.T @ [50 * away, 0.0, -50.0]
         block = block_of(PERSPECTIVE, image_of(PERSPECTIVE, X)[None], X)
+        assert block.ground_sample_distance == pytest.approx(50.0 / F, rel=1e-6)
+        assert ground_sample_distance(block.result) == pytest.approx(50.0 / F, rel=1e-6)
+        # and where no named point has a position
+        block.row_of_determined = {}
         assert block.ground_sample_distance == pytest.approx(50.0 / F, rel=1e-6)
 
 

@@ -43,11 +43,14 @@ def test_the_observed_principal_distance_moves_with_its_start_value():
     np.testing.assert_allclose(observed.sigma, [80.0, 2e-4, 50.0])
 
 
-def adjusted_to(ratio, stated, side=4000):
-    """An adjustment from a principal distance of `stated` longer sides to `ratio` times it."""
-    camera = Camera("c", "opencv", {"fx": stated * side, "fy": stated * side},
-                    image_size=(3000, side))  # fmt: skip
-    parameters = {"fx": {"value": ratio * stated * side}}
+SIDE = 4000
+
+
+def adjusted_to(f, start):
+    """An adjustment from and to principal distances in longer sides."""
+    camera = Camera("c", "opencv", {"fx": start * SIDE, "fy": start * SIDE},
+                    image_size=(3000, SIDE))  # fmt: skip
+    parameters = {"fx": {"value": f * SIDE}}
     return SimpleNamespace(
         converged=True, network=SimpleNamespace(cameras=(camera,)),
         cameras={"c": {"parameters": parameters}},
@@ -56,11 +59,13 @@ def adjusted_to(ratio, stated, side=4000):
 
 def test_a_stated_principal_distance_is_plausible_of_any_lens():
     """600 mm of full frame are 17 longer sides, a fisheye in the plane 0.2: as stated, or a tenth
-    off; not if nothing is known of the lens, nor where adjustments end that fail."""
-    plausible = lambda ratio, stated, guessed=(): starting.is_plausible(
-        adjusted_to(ratio, stated), guessed
+    off, whatever the adjustment began with; not if nothing is known of the lens, nor where
+    adjustments end that fail."""
+    plausible = lambda stated, ratio, start=1.0: starting.is_plausible(
+        adjusted_to(ratio * stated, start * stated), {"c": stated * SIDE}
     )
     for stated in (0.2, 1.0, 17.0):
-        assert plausible(1.0, stated) and plausible(1.1, stated) and plausible(0.9, stated)
-        assert plausible(1.0, stated, ["c"]) == (stated == 1.0)
-        assert not any(plausible(ratio, stated) for ratio in (0.0, 1e-4, 1e4, np.inf, np.nan))
+        assert plausible(stated, 1.0) and plausible(stated, 1.1) and plausible(stated, 0.9)
+        assert plausible(stated, 1.4, 0.7) and plausible(stated, 1.6, 1.3) == (stated == 1.0)
+        assert starting.is_plausible(adjusted_to(stated, stated), {}) == (stated == 1.0)
+        assert not any(plausible(stated, ratio) for ratio in (0.0, 1e-4, 1e4, np.inf, np.nan))

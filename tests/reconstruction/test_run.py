@@ -1,5 +1,6 @@
 """Stages of a reconstruction whose parts are given."""
 
+import copy
 import dataclasses
 from types import SimpleNamespace
 
@@ -7,7 +8,11 @@ import numpy as np
 import pytest
 
 from jaxbundle import Camera
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.tables import Images
 from jaxbundle.reconstruction import reconstruct, square_pixels
+from jaxbundle.reconstruction.named import NamedMeasurements, no_named_points
+from jaxbundle.reconstruction.network import FurtherData
 from jaxbundle.reconstruction.photographs import Cameras
 from jaxbundle.reconstruction.reconstruct import ReconstructionSettings, _ReconstructionRun
 from jaxbundle.tiepoints.matching import FeatureMatches
@@ -68,6 +73,30 @@ class Connection:
     images: tuple[int, int]
 
 
+@dataclasses.dataclass
+class Adjusted:
+    network: SimpleNamespace
+    with_changes = copy.copy
+
+
+@dataclasses.dataclass
+class Part:
+    name: str
+    adjustment: Adjusted
+
+
+def part_of(group, name):
+    """A part of these photographs, and its network with its name."""
+    n = len(group)
+    zeros = np.zeros((n, 6))
+    images = Images(tuple(f"{k}.jpg" for k in group), zeros[:, 0].astype(int), zeros[:, :3],
+                    zeros[:, 3:], zeros)  # fmt: skip
+    network = lambda name: SimpleNamespace(
+        images=images, name=name, replace=lambda name: network(name)
+    )
+    return Part(name, Adjusted(network(name)))
+
+
 @pytest.mark.parametrize("left, parts", [(2, 1), (3, 2)])
 def test_what_is_left_of_a_part_is_another_one_if_it_is_large_enough(run, monkeypatch, left, parts):
     """Of three photographs or more; fewer are left out with the reason that the first part gave."""
@@ -77,11 +106,10 @@ def test_what_is_left_of_a_part_is_another_one_if_it_is_large_enough(run, monkey
     pairs = [Connection((k, k + 1)) for k in range(n - 1)]
     made = []
 
-    def make(group, *_):
+    def make(group, features, pairs, name):
         made.append(group)
         reasons = {f"{k}.jpg": "elsewhere" for k in group[5:]} if len(made) == 1 else {}
-        network = SimpleNamespace(images=group)
-        return SimpleNamespace(adjustment=SimpleNamespace(network=network)), reasons
+        return part_of([k for k in group if f"{k}.jpg" not in reasons], name), reasons
 
     monkeypatch.setattr(run, "_make_part", make)
     assert len(run._make_parts([], [], pairs)) == parts
@@ -90,28 +118,143 @@ def test_what_is_left_of_a_part_is_another_one_if_it_is_large_enough(run, monkey
     assert run.left_out == expected
 
 
-@pytest.mark.parametrize("confirmed", [True, False])
+def three_groups(run, monkeypatch, make):
+    """The parts of ten photographs in groups of four and twice three."""
+    run.photographs = [SimpleNamespace(name=f"{k}.jpg") for k in range(10)]
+    run.names = [photograph.name for photograph in run.photographs]
+    pairs = [Connection((k, k + 1)) for k in range(9) if k not in (3, 6)]
+    monkeypatch.setattr(run, "_make_part", make)
+    return run._make_parts([], [], pairs)
+
+
+def test_a_photograph_that_is_lost_has_a_reason(run, monkeypatch):
+    """That of its part, if this failed; and if none of its points were chosen. What is said of
+    a part that failed is not said of the next one, which has its name."""
+
+    def make(group, features, pairs, name):
+        run.notes.append(f"{name}: {len(group)} photographs")
+        if group[0] == 4:
+            raise NotSolvedError("not solved: impossible principal distance")
+        return part_of(group[:3], name), {}
+
+    parts = three_groups(run, monkeypatch, make)
+    assert [part.name for part in parts] == ["part 1", "part 2"]
+    assert run.notes == ["part 1: 4 photographs", "part 2: 3 photographs"]
+    why = "its part could not be oriented: impossible principal distance"
+    assert run.left_out == {"3.jpg": "none of its tie points is used",
+                            **{f"{k}.jpg": why for k in (4, 5, 6)}}  # fmt: skip
+
+
+def test_parts_are_numbered_by_what_is_left_of_them(run, monkeypatch):
+    """The first group has lost two of its four photographs."""
+    run.title = "job"
+
+    def make(group, features, pairs, name):
+        run.notes.append(f"{name}: begins with {group[0]}")
+        run._warn(f"{name}: begins with {group[0]}")
+        return part_of(group[:2] if group[0] == 0 else group, name), {}
+
+    parts = three_groups(run, monkeypatch, make)
+    assert [part.name for part in parts] == ["part 1", "part 2", "part 3"]
+    assert [part.adjustment.network.images.id[0] for part in parts] == ["4.jpg", "7.jpg", "0.jpg"]
+    names = ["job", "job, part 2", "job, part 3"]
+    assert [part.adjustment.network.name for part in parts] == names
+    said = ["part 3: begins with 0", "part 1: begins with 4", "part 2: begins with 7"]
+    assert run.notes == said and [words for _, words in run.warnings] == said
+
+
+def test_targets_of_other_groups_are_not_in_the_network_of_a_part(run, monkeypatch):
+    nothing = np.zeros((3, 2))
+    named = NamedMeasurements(np.arange(3), ("a", "b", "c"), nothing, nothing)
+    monkeypatch.setattr(reconstruct, "photograph_network", lambda *given: given[3].named)
+    assert run._make_network("part 1", [0, 2], None, FurtherData(named)).name == ("a", "c")
+
+
+@pytest.mark.parametrize("natural", [True, False])
+def test_a_photograph_needs_no_more_targets_than_a_pair(run, monkeypatch, natural):
+    """Where they alone connect the photographs; of features fewer than twelve may be wrong."""
+    run.settings = ReconstructionSettings(targets="ring14", natural_points=natural)
+    run.cameras = Cameras((), (), (), True, ())
+
+    def start(network, guessed, pairs, settings):
+        expected = settings.min_rays if natural else run.settings.min_common_targets
+        assert settings.min_rays == expected == (12 if natural else 8)
+        raise NotSolvedError("asked")
+
+    monkeypatch.setattr(reconstruct, "start_values", start)
+    with pytest.raises(NotSolvedError, match="asked"):
+        run._adjust_first(None, None, {})
+
+
+def test_a_damaged_photograph_without_targets_is_told_as_damaged(run, monkeypatch):
+    """Not that it has too few targets."""
+
+    def read(path):
+        if path == "1.jpg":
+            raise InputError("1.jpg: the file ends early")
+
+    monkeypatch.setattr(reconstruct, "read_photograph", read)
+    run.further = FurtherData(no_named_points())
+    for photograph in run.photographs:
+        photograph.path = photograph.name
+    with pytest.raises(InputError, match="fewer than two photographs"):
+        run._match_named()
+    assert run.left_out["1.jpg"] == "the file ends early"
+    assert run.left_out["2.jpg"] == "0 coded targets, at least 8 are needed"
+
+
+@pytest.mark.parametrize("workers, given", [(0, None), (3, 3)])
+def test_targets_are_searched_on_as_many_cores_as_the_settings_say(monkeypatch, workers, given):
+    """On all of them without a number."""
+
+    def find(photographs, targets, control, workers, uncoded):
+        assert workers == given
+        raise InputError("asked")
+
+    for name, found in {"find_photographs": ([], {}), "assign_cameras": None}.items():
+        monkeypatch.setattr(reconstruct, name, lambda *_, found=found: found)
+    monkeypatch.setattr(reconstruct, "find_named", find)
+    with pytest.raises(InputError, match="asked"):
+        reconstruct.reconstruct([], settings=ReconstructionSettings(workers=workers))
+
+
+@pytest.mark.parametrize("confirmed, solved", [
+    (True, True), (False, True), (True, False), (True, None),
+])  # fmt: skip
 def test_pixels_are_released_only_if_both_halves_of_the_photographs_agree(
-    run, monkeypatch, confirmed
+    run, monkeypatch, confirmed, solved
 ):
-    """Otherwise the adjustment with square pixels is the result."""
+    """And the adjustment has a plausible solution; otherwise that with square pixels is the
+    result."""
     ratio = square_pixels.Ratio(0.02, 0.001)
     monkeypatch.setattr(square_pixels, "contradicted_ratios", lambda _: {"cam": ratio})
     monkeypatch.setattr(square_pixels, "replicated_ratios", lambda _: {"cam": (ratio, ratio)})
     monkeypatch.setattr(square_pixels, "is_replicated", lambda *_: confirmed)
     monkeypatch.setattr(square_pixels, "release", lambda network, ids: (network, [*ids]))
     monkeypatch.setattr(reconstruct.dataclasses, "replace", lambda _, network: network)
-    monkeypatch.setattr(run, "_adjust", lambda network, measured: (network, "again"))
+    better = SimpleNamespace(adjustment=SimpleNamespace(converged=True, cameras={}))
+
+    def adjust(network, measured):
+        assert network == ("network", ["cam"])
+        if solved is None:
+            raise NotSolvedError("not solved")
+        return better, "again"
+
+    monkeypatch.setattr(run, "_adjust", adjust)
+    monkeypatch.setattr(reconstruct, "is_plausible", lambda *_: solved)
+    run.cameras = Cameras((), (), (), True, ())
     oriented, weighted = SimpleNamespace(network="network"), SimpleNamespace(adjustment=None)
     found = run._check_ratios(oriented, weighted, None, "first")
-    assert found == ((("network", ["cam"]), "again") if confirmed else (weighted, "first"))
-    assert ("are not square" in run.notes[-1]) == confirmed
+    assert found == ((better, "again") if confirmed and solved else (weighted, "first"))
+    (note,) = run.notes
+    assert ("are not square" in note) == bool(confirmed and solved) != ("as square" in note)
 
 
 @pytest.mark.parametrize("correlated", [True, False])
 def test_parts_state_errors_that_image_points_share_unless_turned_off(run, monkeypatch, correlated):
-    examined = SimpleNamespace()
-    adjusted = SimpleNamespace(with_correlated_errors=lambda: examined)
+    network = SimpleNamespace(distances=())
+    examined = SimpleNamespace(network=network)
+    adjusted = SimpleNamespace(network=network, with_correlated_errors=lambda: examined)
     weighted = SimpleNamespace(adjustment=adjusted, factors={}, unused_points=0)
     none = np.zeros(0, int)
     measured = SimpleNamespace(is_template=none > 0, track=none, colour=np.zeros((0, 3), int))
@@ -127,5 +270,9 @@ def test_parts_state_errors_that_image_points_share_unless_turned_off(run, monke
     }.items():  # fmt: skip
         monkeypatch.setattr(run, name, lambda *_, found=found: found)
     run.settings = ReconstructionSettings(correlated=correlated)
+    run.further = FurtherData(no_named_points(), distances=({"from": "a", "to": "b"},))
     part, _ = run._make_part([], [], [], "part 1")
     assert part.adjustment is (examined if correlated else adjusted)
+    # without scale bars of its own, though another part has some
+    (note,) = run.notes
+    assert note.startswith("part 1: position, orientation and scale are arbitrary")
