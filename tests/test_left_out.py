@@ -86,6 +86,10 @@ def test_rays_that_fit_exactly_are_not_tested():
     seen, model = random_rays(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[3.0, 0, 0]]))
     for found in rays_coincide(seen, model, np.ones(1, bool), factor=0.0):
         assert not found.any()
+    # Of images fewer than three points are on a line all the same.
+    assert see_collinear_points(seen, model, factor=0.0).all()
+    three = np.arange(3.0)[:, None] * [0, 1, 0] + [3, 0, 0]
+    assert not see_collinear_points(*random_rays(np.zeros((1, 3)), three), factor=0.0).any()
 
 
 def test_images_from_one_place_are_named_as_such_for_their_points_only():

@@ -32,10 +32,11 @@ RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
 MM = Camera("cam", "brown", {"c": 24.0}, image_size=(6000, 4000), pixel_size=(0.006, 0.006))
 PX = Camera("cam", "opencv", {"fx": 4000.0, "fy": 4000.0, "cx": 2999.5, "cy": 1999.5},
             image_size=(6000, 4000))  # fmt: skip
+UP = Camera("cam", "snavely", {"f": 4000.0}, image_size=(6000, 4000))
 
 
 def network(camera=MM, **options):
-    noise = 0.3 * (1 if camera is PX else 0.006)
+    noise = 0.3 * (1 if camera in (PX, UP) else 0.006)
     return simulate(RING, TARGETS, camera, noise=noise, seed=3, disturb=0.005, **options)
 
 
@@ -130,6 +131,8 @@ MISREAD = [
     (MM, lambda xy: xy * [1, -1] + HALF, "a corner of the image and y is counted in the other"),
     (PX, lambda uv: uv * [1, -1] + [0, 3999], "v is counted in the other direction"),
     (PX, lambda uv: uv - CENTRE, "from the image centre: expected"),
+    (UP, lambda xy: xy * [1, -1], "y is counted in the other direction: expected are pixels from"),
+    (UP, lambda xy: xy * [1, -1] + CENTRE, "a corner of the image and y is counted in the other"),
 ]
 
 
@@ -153,6 +156,7 @@ def test_a_flipped_axis_is_the_first_line_of_a_report_without_result():
 @pytest.mark.parametrize("camera, misread, said", [
     (MM, lambda xy: xy + HALF, "are they counted from a corner of the image?"),
     (PX, lambda uv: uv - CENTRE, "are they counted from the image centre?"),
+    (UP, lambda xy: xy * [1, -1] + CENTRE, "from a corner of the image? Expected are pixels from"),
     (PX, lambda uv: (uv - CENTRE) * [0.006, -0.006], "are they in mm?"),
 ])  # fmt: skip
 def test_coordinates_where_no_image_is_name_their_origin_or_unit(camera, misread, said):
@@ -336,11 +340,13 @@ def test_poor_start_values_are_not_taken_for_a_mirror_image():
     assert next(sigma0, None) is None
 
 
-def test_coordinates_from_a_corner_are_named_without_the_size_of_the_image():
+@pytest.mark.parametrize("corner", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+def test_coordinates_from_a_corner_are_named_without_the_size_of_the_image(corner):
     camera = dataclasses.replace(MM, image_size=None, pixel_size=None)
     given = network().replace(cameras=(camera,))
     assert name_image_extent(given) == ""
-    assert "counted from a corner?" in name_image_extent(with_xy(given, lambda xy: xy + HALF))
+    said = name_image_extent(with_xy(given, lambda xy: xy + corner * HALF))
+    assert "counted from a corner?" in said
 
 
 def test_control_in_mm_beside_start_values_in_m_is_named_where_nothing_is_solved():

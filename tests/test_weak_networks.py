@@ -4,6 +4,7 @@ Four images of 25 targets; of the first two shapes (with and without control) al
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from jaxbundle.adjustment.quality.weakness import (
 from jaxbundle.cli.outputs import why_not
 from jaxbundle.network.build import make_further
 from jaxbundle.network.repetitions import warn_of_repetitions
+from jaxbundle.orientation import one_place
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.planning.stations import Stations
 from jaxbundle.report.head import failure_facts, warnings
@@ -151,6 +153,15 @@ def test_two_images_from_one_place_are_told_from_two_that_are_not():
     two = lambda stations: network(Stations(stations.position[:2], stations.angles[:2]), camera())
     assert "'1', '2'" in name_one_place(two(ONE_PLACE))
     assert name_one_place(two(RING)) == ""
+
+
+def test_all_images_from_one_place_are_counted(monkeypatch):
+    """Of 300 images 200 are tested."""
+    sights = SimpleNamespace(image=np.arange(300), images=300)
+    monkeypatch.setattr(one_place, "make_sights", lambda _: sights)
+    monkeypatch.setattr(one_place, "_is_rotation", lambda *_: True)
+    images = SimpleNamespace(id=[f"i{k}" for k in range(300)])
+    assert "and 295 more were taken" in name_one_place(SimpleNamespace(images=images))
 
 
 def test_a_narrow_field_cannot_tell_a_turn_from_a_shift():

@@ -143,8 +143,13 @@ def similarity(
     target: Float[np.ndarray, "n 3"],
     weights: Float[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
-    """A = exp(s)·R and t of X' = A·X + t between two lists of points; None of points on a line."""
-    rows = [evenly_spaced(len(source))]
+    """A = exp(s)·R and t of X' = A·X + t between two lists of points; None of fewer than three
+    points of weight > 0, and of points on a line."""
+    # Spread over the points that count: of many points, few of these may be among `SLOTS` of all.
+    weighted_rows = np.flatnonzero(weights > 0)
+    if len(weighted_rows) < 3:
+        return None
+    rows = [weighted_rows[evenly_spaced(len(weighted_rows))]]
     A, t, status = run_in_lanes(
         _similarity,
         1,

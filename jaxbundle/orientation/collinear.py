@@ -85,6 +85,8 @@ def see_collinear_points(
     rows = np.flatnonzero(model.known[sights.point] & (sights.sigma > 0))
     image = sights.image[rows]
     number = np.bincount(image, minlength=sights.images)
+    if not factor > 0:
+        return (number > 0) & (number < 3)
     X, placed = model.X[sights.point[rows]], model.placed[image]
     distance = np.linalg.norm(X - model.X0[image], axis=1)
     distance = np.where(placed, distance, usual_distances(sights, model)[image])

@@ -84,8 +84,8 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
 
     The most improbable point, or pair of points, is left out while its probability is below the
     level for as many tests; finally those that the remaining ones predict well are used again. At
-    least half of the points stay: if more contradict their given σ, these are wrong, and all are
-    multiplied by one factor.
+    least half of the points stay, and four: if half of them or more contradict their given σ, and
+    some that stay do as well, these are wrong, and all are multiplied by one factor.
 
     **Arguments:** `assumed`: σ if the points do not determine it, and the smallest estimated one;
     `significance`: probability of suspecting any point of control without contradictions.
@@ -101,9 +101,9 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
             np.zeros(0),
             both_assumed,
         )
-    is_used = _search(discrepancies, assumed, significance)
+    is_used, most_contradict = _search(discrepancies, assumed, significance)
     factor = 1.0
-    if 2 * (~is_used).sum() >= len(discrepancies) and np.isfinite(discrepancies.sigma).any():
+    if most_contradict and np.isfinite(discrepancies.sigma).any():
         everything = np.ones(len(discrepancies), bool)
         sigma, *_ = _resolve(discrepancies, everything, assumed)
         W, d, rows = _weight_matrix(discrepancies, sigma, everything)
@@ -113,7 +113,7 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
             np.isfinite(discrepancies.sigma), discrepancies.sigma * factor, discrepancies.sigma
         )
         discrepancies = dataclasses.replace(discrepancies, sigma=scaled)
-        is_used = _search(discrepancies, assumed, significance)
+        is_used, _ = _search(discrepancies, assumed, significance)
     sigma, redundancy, guessed = _resolve(discrepancies, is_used, assumed)
     error, error_sigma = np.full((2, len(discrepancies), 3), np.nan)
     probability = np.full(len(discrepancies), np.nan)
@@ -131,21 +131,23 @@ def assess(discrepancies: Discrepancies, assumed: float, significance: float = 0
 
 def _search(
     discrepancies: Discrepancies, assumed: float, significance: float
-) -> Bool[np.ndarray, " n"]:
-    """Which points do not contradict the others."""
-    is_used = np.ones(len(discrepancies), bool)
-    fewest = max(MIN_AGREEING, (len(discrepancies) + 1) // 2)
-    while worst := _most_improbable(
-        discrepancies, is_used, assumed, significance, is_used.sum() - fewest
-    ):
+) -> tuple[Bool[np.ndarray, " n"], bool]:
+    """Which points do not contradict the others, and whether half of all or more do, and would
+    leave too few."""
+    n, most_contradict = len(discrepancies), False
+    is_used = np.ones(n, bool)
+    fewest = max(MIN_AGREEING, (n + 1) // 2)
+    while worst := _most_improbable(discrepancies, is_used, assumed, significance):
+        if is_used.sum() - len(worst) < fewest:
+            contradicting = (~is_used).sum() + len(worst)
+            most_contradict = n > MIN_AGREEING and 2 * contradicting >= n
+            break
         is_used[worst] = False
     left_out = np.flatnonzero(~is_used).tolist()
     for i in sorted(left_out, key=lambda i: -_probability(discrepancies, is_used, [i], assumed)):
-        if _probability(discrepancies, is_used, [i], assumed) > level_of_one(
-            significance, len(discrepancies)
-        ):
+        if _probability(discrepancies, is_used, [i], assumed) > level_of_one(significance, n):
             is_used[i] = True
-    return is_used
+    return is_used, most_contradict
 
 
 def _most_improbable(
@@ -153,10 +155,8 @@ def _most_improbable(
     is_used: Bool[np.ndarray, " n"],
     assumed: float,
     significance: float,
-    max_points: int,
 ) -> list[int]:
-    """The point, or else the two points, of at most this number, that are most improbable; none if
-    chance explains all."""
+    """The point, or else the two points, that are most improbable; none if chance explains all."""
     rows = np.flatnonzero(is_used).tolist()
     tests_pairs = len(rows) <= MAX_POINTS_FOR_PAIRS
     # Of many points one changes the estimated σ by too little to matter.
@@ -165,7 +165,7 @@ def _most_improbable(
         [[i] for i in rows],
         [list(p) for p in itertools.combinations(rows, 2)] * tests_pairs,
     ):
-        if tests and len(tests[0]) <= max_points:
+        if tests:
             p = [_probability(discrepancies, is_used, test, assumed, common) for test in tests]
             if min(p) < level_of_one(significance, len(tests)):
                 return tests[int(np.argmin(p))]

@@ -122,13 +122,15 @@ def refine_camera(
     weights: Float[AnyArray, " n"] | None = None,
     radial: int = 0,
 ) -> RefinedCamera:
-    """Eleven parameters, and `radial` ones of distortion, by least squares, differentiable.
+    """Eleven parameters, and `radial` ones of distortion, by least squares, differentiable; as many
+    as the camera has if these are more.
 
     Arguments as in `direct_linear_transformation`; `UNDETERMINED` where the points do not give
     all parameters.
     """
     p = ones_unless(weights, xy)
-    added_terms = radial - camera.radial.shape[0]
+    radial = max(radial, len(camera.radial))
+    added_terms = radial - len(camera.radial)
     start = CameraWithPose(camera.interior, jnp.pad(camera.radial, (0, added_terms)), camera.pose)
     data = (xy, X, jnp.sqrt(p))
     fit = adjust(_misclosures, _retract, start, data, 11 + radial)

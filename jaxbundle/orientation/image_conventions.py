@@ -1,11 +1,11 @@
 """Image coordinates in another convention than the expected one: an axis in the other direction,
 exchanged axes, another origin.
 
-Expected are pixels from the centre of the upper-left one, u right and v down, or mm from the image
-centre, x right and y up, as the model of the camera has it. Start values of images and points
-predict every image point. If the predictions are far from the measurements, but near one of the
-eight symmetries of the image, about its centre or about a corner, that is their convention. Without
-start values the extent of the coordinates shows another origin or unit.
+Expected are pixels from the centre of the upper-left one, u right and v down, or mm or pixels from
+the image centre, x right and y up, as the model of the camera has it. Start values of images and
+points predict every image point. If the predictions are far from the measurements, but near one of
+the eight symmetries of the image, about its centre or about a corner, that is their convention.
+Without start values the extent of the coordinates shows another origin or unit.
 """
 
 import dataclasses
@@ -34,6 +34,7 @@ SYMMETRIES = {
 }
 EXPECTED_CONVENTION = {
     "px": "pixels from the centre of the upper-left pixel, u right, v down",
+    "px up": "pixels from the image centre, x right, y up",
     "mm": "mm from the image centre, x right, y up",
 }
 
@@ -60,8 +61,8 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     rows = np.flatnonzero(placed[rays.image] & has_coordinates[rays.point])
     if not len(rows):
         return ""
-    # The median of 2000 is known to 3 % of its spread (1.25/√n): more than enough to recognise a
-    # factor of ten, of up to sixteen conventions.
+    # The median of 2000 is known to 3 % of its spread (1.25/√n): more than enough to recognise the
+    # factor of five of `explains_better`, of up to sixteen conventions.
     rows = rows[batched.evenly_spaced(len(rows), 2000)]
     sample = network.replace(observations=rays.take(rows))
     centres, halves = (np.array(v) for v in zip(*(image_frame(c) for c in network.cameras)))
@@ -85,35 +86,41 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     if not explains_better(medians[best], medians[IDENTITY, False]):
         return ""
     # As they were given: pixels may be of a camera in mm.
-    unit = network.image_unit
-    if unit not in EXPECTED_CONVENTION:
-        unit = get_model(network.cameras[0].model).unit
-    x, y = ("u", "v") if unit == "px" else ("x", "y")
+    convention = _convention(network.cameras[0], network.image_unit)
+    x, y = ("u", "v") if convention == "px" else ("x", "y")
     words = []
     if best[1]:
         words.append(
             "they are counted from the image centre"
-            if unit == "px"
+            if convention == "px"
             else "they are counted from a corner of the image"
         )
     if best[0] != IDENTITY:
         words.append(SYMMETRIES[best[0]].format(x=x, y=y))
     return (
         f"the image coordinates fit the start values if {' and '.join(words)}: expected are "
-        f"{EXPECTED_CONVENTION[unit]}; change them in the input"
+        f"{EXPECTED_CONVENTION[convention]}; change them in the input"
     )
+
+
+def _convention(camera: Camera, unit: str = "") -> str:
+    """The key in `EXPECTED_CONVENTION` of coordinates in this unit, or in that of the model."""
+    model = get_model(camera.model)
+    unit = unit if unit in ("px", "mm") else model.unit
+    return "px up" if unit == model.unit == "px" and model.axes == "up" else unit
 
 
 def image_frame(camera: Camera) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """The image centre, and half the size of the image, in the unit of the model; NaN: unknown."""
-    size, pitch = camera.image_size, camera.pixel_size
-    if get_model(camera.model).unit == "px":
+    model, size, pitch = get_model(camera.model), camera.image_size, camera.pixel_size
+    if model.axes == "down":
         half_size = np.full(2, np.nan) if size is None else np.array(size) / 2
-        point = [camera.parameters.get(n, 0.0) for n in get_model(camera.model).principal_point]
+        point = [camera.parameters.get(n, 0.0) for n in model.principal_point]
         centre = (
             half_size - 0.5 if size is not None else np.array(point if len(point) == 2 else [0, 0])
         )
         return np.asarray(centre, float), half_size
+    pitch = (1.0, 1.0) if model.unit == "px" else pitch
     has_size = size is not None and pitch is not None
     return np.zeros(2), np.array(size) * pitch / 2 if has_size else np.full(2, np.nan)
 
@@ -141,16 +148,18 @@ def name_image_extent(network: Network) -> str:
         centre, half_size = image_frame(camera)
         if not len(xy):
             continue
-        unit = get_model(camera.model).unit
+        unit, convention = get_model(camera.model).unit, _convention(camera)
+        # Without a hundredth at either end: a few blunders would hide where the others are.
         low, high = np.quantile(xy, [0.01, 0.99], axis=0)
         if not np.isfinite(half_size).all():
             # Six points are in one quadrant of an image by chance once in 4⁵ = 1000 times.
-            if unit == "mm" and len(xy) >= 6 and ((low > 0).all() or (high < 0).all()):
+            one_sided = ((low > 0) | (high < 0)).all()
+            if convention != "px" and len(xy) >= 6 and one_sided:
                 return (
                     f"camera {camera.id!r}: the image coordinates run from {low[0]:.4g}, "
-                    f"{low[1]:.4g} to {high[0]:.4g}, {high[1]:.4g} mm, all on one side of the "
+                    f"{low[1]:.4g} to {high[0]:.4g}, {high[1]:.4g} {unit}, all on one side of the "
                     "image centre: are they counted from a corner? Expected are "
-                    f"{EXPECTED_CONVENTION[unit]}"
+                    f"{EXPECTED_CONVENTION[convention]}"
                 )
             continue
         description = (
@@ -162,15 +171,15 @@ def name_image_extent(network: Network) -> str:
         # In mm all points lie within 2 % of the image about its first pixel: a sensor of 36 mm has
         # 2000 columns and more.
         if unit == "px" and (np.abs([low, high]) < 0.02 * 2 * half_size).all():
-            return f"{description}: are they in mm? Expected are {EXPECTED_CONVENTION[unit]}"
+            return f"{description}: are they in mm? Expected are {EXPECTED_CONVENTION[convention]}"
         # Of coordinates from the centre, taken for coordinates from a corner, three quarters lie
         # outside the image; blunders are fewer than a quarter.
         outside_share = (np.abs(xy - centre) > half_size).any(1).mean()
         shifted = np.where(centre == 0, half_size, 0.0)
         if outside_share > 0.25 and (np.abs(xy - shifted) <= half_size).all(1).mean() > 0.99:
-            origin = "the image centre" if unit == "px" else "a corner of the image"
+            origin = "the image centre" if convention == "px" else "a corner of the image"
             return (
                 f"{description}: are they counted from {origin}? Expected are "
-                f"{EXPECTED_CONVENTION[unit]}"
+                f"{EXPECTED_CONVENTION[convention]}"
             )
     return ""

@@ -194,7 +194,7 @@ def find_start_values(
         )
     if why:
         raise _no_start_values(network, why)
-    if is_missed.any() and remaining_control < 3:
+    if is_missed.any() and remaining_control < 3 and not finding:
         finding = name_suspects(network, is_missed)
     if not finding:
         return oriented

@@ -28,10 +28,11 @@ def name_one_place(network: Network) -> str:
     sights = make_sights(network)
     number = np.bincount(sights.image, minlength=sights.images)
     base = int(number.argmax())
+    other_images = [image for image in np.flatnonzero(number).tolist() if image != base]
     # Two hundred images that differ from the first by a rotation only are from one place, however
-    # many follow; the message then names all images.
-    other_images = [image for image in np.flatnonzero(number).tolist() if image != base][:200]
-    if not other_images or not all(_is_rotation(sights, base, image) for image in other_images):
+    # many follow; the message counts all images.
+    tested_images = other_images[:200]
+    if not tested_images or not all(_is_rotation(sights, base, image) for image in tested_images):
         return ""
     names = [network.images.id[image] for image in sorted([base, *other_images])]
     return (

@@ -81,5 +81,7 @@ def planar_orientations(
         return M, b / jnp.where(length > 0, length, 1.0), n, jnp.all(front | (p == 0))
 
     M, b, n, possible = jax.vmap(solution)(jnp.array([1.0, -1.0]))
-    status = first_of((no_base, Status.NO_BASE), (status != Status.SOUND, Status.UNDETERMINED))
+    # A homography that the points leave open says nothing about the base.
+    is_open = status != int(Status.SOUND)
+    status = jnp.where(is_open, status, first_of((no_base, Status.NO_BASE)))
     return PlanarOrientations(M, b, n, possible & ~no_base, status)

@@ -86,10 +86,12 @@ def test_two_exchanged_points_do_not_hide_each_other(seed):
     assert np.flatnonzero(~assess(found, ASSUMED).used).tolist() == [i, j]
 
 
-def test_sigma_that_nothing_agrees_with_is_multiplied():
-    _, found = block(8, 3, sigma=1.0, stated=0.02)
+@pytest.mark.parametrize("n", [6, 8, 9, 15])
+def test_sigma_that_nothing_agrees_with_is_multiplied(n):
+    """By about 50 = 1/0.02."""
+    _, found = block(n, 3, sigma=1.0, stated=0.02)
     result = assess(found, ASSUMED)
-    assert result.used.sum() >= 7 and result.factor > 20
+    assert result.used.sum() >= n - 1 and 20 < result.factor < 100
 
 
 @pytest.mark.parametrize("plane, least", [(np.inf, 1.0), (0.5, 0.05)])
@@ -111,9 +113,10 @@ def test_a_probability_is_at_most_one():
         assert 0.9 < assess(found, ASSUMED).probability.max() <= 1
 
 
-def test_a_sigma_that_is_not_given_is_not_multiplied():
-    """Half of the points contradict the others: only a given σ could be wrong."""
-    _, found = block(8, 3, sigma=0.01)
+@pytest.mark.parametrize("n, stated", [(8, np.nan), (9, np.nan), (9, 0.01), (8, 0.01)])
+def test_a_sigma_that_half_of_the_points_fit_is_not_multiplied(n, stated):
+    """Four points contradict the others, which agree."""
+    _, found = block(n, 3, sigma=0.01, stated=stated)
     found.difference[:4] += [[30, 0, 0], [0, 50, 10], [-60, 20, 0], [0, -80, -30]]
     result = assess(found, ASSUMED)
     assert np.flatnonzero(~result.used).tolist() == [0, 1, 2, 3] and result.factor == 1

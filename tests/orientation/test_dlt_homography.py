@@ -63,6 +63,9 @@ def test_refined_with_distortion():
     np.testing.assert_allclose(result.camera.radial, 2e-4, atol=1e-9)
     np.testing.assert_allclose(result.camera.pose.X0, X0, atol=1e-7)
     assert (result.status == Status.SOUND).all()
+    first = jax.tree.map(lambda a: a[0], result.camera)
+    again = refine_camera(first, measured(xy, 2e-4)[0], X[0])  # with the distortion that it has
+    np.testing.assert_allclose(again.camera.radial, 2e-4, atol=1e-9)
 
 
 def test_against_scipy():

@@ -111,6 +111,8 @@ def test_both_solutions_of_a_plane():
     assert not five(xy1, xy2).flat.any()
     xy1, xy2, *_ = pairs(N, n, seed=4, base=0.0)
     assert (batch(planar_orientations)(xy1, xy2).status == Status.NO_BASE).all()
+    on_a_line = np.arange(n)[:, None] * [0.02, 0.01]
+    assert planar_orientations(on_a_line, 1.1 * on_a_line).status == Status.COLLINEAR_POINTS
 
 
 def test_a_plane_must_be_in_front_of_the_second_camera_too():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxbundle.network.tables import Points
-from jaxbundle.orientation import alignment
+from jaxbundle.orientation import alignment, batched
 from jaxbundle.orientation.alignment import similarity, similarity_of_most
 from jaxbundle.orientation.swapped_control import contradiction
 
@@ -124,6 +124,25 @@ def test_the_similarity_of_most_points_is_not_spoilt_by_a_third_of_wrong_ones():
     np.testing.assert_allclose(POINTS @ A.T + t, POINTS @ expected[0].T + expected[1], atol=1e-12)
     on_a_line = np.arange(5.0)[:, None] * [1.0, 2.0, 3.0]
     assert similarity_of_most(on_a_line, on_a_line) is None
+
+
+def test_of_many_points_some_count():
+    """The similarity of three, six or a hundred of 400 points; of two there is none."""
+    source = np.random.default_rng(6).normal(size=(400, 3))
+    target = 2 * source @ TURN.T + [5, 6, 7]
+    for used in (3, 6, 100):
+        weights = np.zeros(400)
+        weights[-used:] = 1
+        A, t = batched.similarity(source, np.where(weights[:, None] > 0, target, 0), weights)
+        np.testing.assert_allclose(source @ A.T + t, target, atol=1e-9)
+    assert batched.similarity(source, target, np.arange(400) < 2) is None
+
+
+def test_two_exchanged_points_of_very_many_are_found():
+    target = np.random.default_rng(7).uniform(-1, 1, (200, 3))
+    source = 0.3 * target @ TURN.T
+    target[[20, 71]] = target[[71, 20]]
+    assert contradiction(source, target).exchanges == [(20, 71)]
 
 
 @pytest.mark.parametrize("mirrored, said", [(0.15, True), (0.25, False)])
