@@ -155,6 +155,15 @@ def _difference_of_jobs(job_a: Adjustment, job_b: Adjustment) -> HalvesDifferenc
         pairs = [(ids[0][0], ids[1][0])]
     names, difference, classical, correlated = [], [], [], []
     for a, b in pairs:
+        models = [
+            next(c.model for c in r.problem.network.cameras if c.id == id)
+            for r, id in ((job_a, a), (job_b, b))
+        ]
+        if models[0] != models[1]:
+            raise NotSolvedError(
+                f"camera {a!r} is of model {models[0]}, camera {b!r} of {models[1]}: parameters of "
+                "the same name mean other things there"
+            )
         free = [r.camera_covariance(id)[0] for r, id in ((job_a, a), (job_b, b))]
         common = [name for name in free[0] if name in free[1]]
         p, q = job_a.camera_parameters(a), job_b.camera_parameters(b)

@@ -33,6 +33,7 @@ from jaxbundle.network.columns import (
     Columns,
     RepeatedIds,
     as_columns,
+    as_id,
     count,
     is_missing,
     refuse_unknown,
@@ -259,7 +260,7 @@ def make_cameras(
 def _camera(
     row: Mapping[str, Any], number: int, where: str, models: Sequence[CameraModel]
 ) -> Camera:
-    id = str(row.get("id", "")).strip() if isinstance(row, Mapping) else ""
+    id = as_id(row.get("id")) if isinstance(row, Mapping) else ""
     if not id:
         raise InputError(f"{where}camera {number}: id is missing")
     model = row.get("model", "brown")

@@ -50,7 +50,7 @@ class RepeatedIds:
         """The labels as ids."""
         if isinstance(self.labels, np.ndarray) and self.labels.dtype.kind in "iu":
             return map(str, self.labels.tolist())
-        return map(_id, self.labels)
+        return map(as_id, self.labels)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Columns:
         values = self.column(name)
         if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
             return tuple(map(str, values.tolist()))
-        ids = tuple(map(_id, values))
+        ids = tuple(map(as_id, values))
         if "" in ids:
             raise InputError(f"{self.source(ids.index(''))}: {name} is missing")
         return ids
@@ -284,7 +284,8 @@ def count(number: SupportsIndex, noun: str, suffix: str = "") -> str:
     return f"{number} {noun}{'' if index(number) == 1 else 's'}{suffix}"
 
 
-def _id(value: Any) -> str:
+def as_id(value: Any) -> str:
+    """An id or word from a cell; empty if it is missing."""
     if isinstance(value, str):
         return value.strip()
     if is_missing(value):

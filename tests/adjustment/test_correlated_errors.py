@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import page_reader
@@ -18,6 +19,8 @@ from jaxbundle.adjustment.quality.correlated_errors import (
 from jaxbundle.adjustment.quality.given_points import given_points_components, wendland
 from jaxbundle.adjustment.quality.replication import compared_parameters
 from jaxbundle.adjustment.quality.weakness import Weakness
+from jaxbundle.adjustment.replicate import _difference_of_jobs
+from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.quality import error_components
 from jaxbundle.leastsquares.quality.error_effects import stack_rows
 from jaxbundle.leastsquares.solution import Solution
@@ -434,6 +437,18 @@ def test_components_that_chance_explains_are_left_out(clean):
     share = np.mean([(equations.solve(q)[0][1:] > 0).any() for q in forms])
     # 5 % of components that share nothing; these do, and are left out one after the other
     assert 0.01 < share < 0.15
+
+
+def test_jobs_of_cameras_of_different_models_are_not_compared():
+    """k1 of one is not k1 of the other."""
+    jobs = [
+        SimpleNamespace(problem=SimpleNamespace(network=SimpleNamespace(
+            cameras=[jaxbundle.Camera("cam", model, {}, ("k1",))]
+        )))
+        for model in ("opencv", "kannala-brandt")
+    ]  # fmt: skip
+    with pytest.raises(NotSolvedError, match="'cam' is of model opencv, .* kannala-brandt"):
+        _difference_of_jobs(*jobs)
 
 
 @pytest.mark.further

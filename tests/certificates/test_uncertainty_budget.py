@@ -83,6 +83,34 @@ def test_the_sum_of_the_budget_is_the_covariance():
     assert len(rows["image"]) == dense.J.shape[0]
 
 
+def test_image_coordinates_have_the_unit_of_the_camera_model():
+    """Measured in pixels, adjusted in the millimetres of the model."""
+    network = synthetic(**{**HELD, "noise": 1.0})[0]
+    result = adjust(network.replace(image_unit="px"))
+    rows = result.residuals
+    assert {*rows["unit"][rows["kind"] == "image"]} == {"mm"}
+    assert result.variance_components["image coordinates"].unit == "mm"
+    of_image = [line for line in uncertainty_budget(result).lines if "image" in line.words]
+    assert of_image and {line.unit for line in of_image} == {"mm"}
+
+
+def test_estimated_sigmas_have_the_redundancy_of_their_own_group():
+    """Of control in X, Y, Z each; the priors of two stations are as stated."""
+    changes = dict(fixed=0, control=4, held=(), distances=((5, 7), (6, 8)), domain="measured")
+    network = synthetic(**{**HELD, "noise": 1.0, **changes})[0]
+    result = adjust(network, estimate_components=True)
+    components, factors = result.variance_components, result.sigma_factors
+    lines = {line.words: line for line in uncertainty_budget(result).lines}
+    estimated = [axis for axis in "XYZ" if factors.get(f"control points in {axis}", 1) != 1]
+    assert estimated
+    for axis in "XYZ":
+        line = lines[f"control {axis}"]
+        assert line.kind == ("A" if axis in estimated else "B")
+        if axis in estimated:
+            redundancy = components[f"control points in {axis}"].redundancy
+            assert line.degrees == pytest.approx(redundancy)
+
+
 @pytest.mark.further
 @pytest.mark.parametrize(("noise", "tolerance"), [(1e-6, 1e-5), (1.0, 0.05)])
 def test_types_of_inputs_are_kept_apart(noise, tolerance):
@@ -133,6 +161,8 @@ def test_held_inputs_by_limits_and_their_degrees_of_freedom():
     assert HeldInput.from_expanded(2.0, 2.0).uncertainty == 1.0
     with pytest.raises(InputError, match="one of normal, rectangular"):
         HeldInput(1.0, "flat")
+    with pytest.raises(InputError, match="degrees must be a positive number"):
+        HeldInput(1.0, degrees=0)
 
 
 @pytest.mark.further

@@ -295,6 +295,11 @@ def test_ids_of_any_kind_are_looked_up_as_text():
         assert rows.tolist() == [2, 1, 2]
 
 
+def test_cameras_numbered_in_a_column_of_floats_have_the_ids_of_images():
+    cameras = make_cameras({"id": np.array([1.0, 2.0]), "c": [10.0, 20.0]})
+    assert [camera.id for camera in cameras] == ["1", "2"]
+
+
 @pytest.mark.parametrize("bad", [-1, 256, 1.5])
 def test_colours_are_whole_numbers_of_eight_bits(bad):
     """Points without one are grey."""

@@ -77,6 +77,10 @@ def test_one_camera_and_what_is_refused():
     assert made.model == "usgs" and cost.exact
     with pytest.raises(InputError, match="camera 'a': pixel_size is needed"):
         convert_one(Camera("a", "brown", {"c": 5.0}, image_size=(10, 10)), "opencv")
+    # A fit over one pixel would say nothing of its error.
+    lens = Camera("a", "brown", {"c": 5.0, "K1": 2e-3, "P1": 1e-4}, pixel_size=(0.005, 0.005))
+    with pytest.raises(InputError, match="camera 'a': image_size is needed, since .* fitted"):
+        convert_one(lens, "snavely")
     with pytest.raises(InputError, match="unknown camera model 'opencx'.*'opencv'"):
         convert_cameras(network(BROWN), "opencx")
 

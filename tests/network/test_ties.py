@@ -189,6 +189,16 @@ def test_ties_that_cannot_be_are_refused(table, message):
             one.check(network)
 
 
+def test_a_parameter_is_free_with_any_of_those_tied_to_it_in_its_camera():
+    network = two_cameras()
+    cameras = [
+        jaxbundle.Camera(id, "opencv", {"fx": 900.0, "fy": 900.0}, ("fx",), tie=(("fx", "fy"),))
+        for id in ("left", "right")
+    ]
+    (ties,) = make_further({"ties": rows("fy")}, 1.0)
+    ties.check(network.replace(cameras=tuple(cameras)))
+
+
 def test_ties_are_written_and_read(tmp_path):
     network = two_cameras(ties=rows(*PAIR, sigma=["exact", 1e-6]))
     jaxbundle.write_project(network, tmp_path)

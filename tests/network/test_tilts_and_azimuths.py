@@ -152,6 +152,12 @@ def test_azimuths_are_on_the_circle(free):
     np.testing.assert_allclose(two.point_values, one.point_values, atol=1e-9)
 
 
+@pytest.mark.parametrize("axes", [("right",), ("right", "view")])
+def test_a_row_has_as_many_equations_as_readings(free, axes):
+    (table,) = make_further({"tilts": tilts(free, axes)}, 1.0)
+    assert table.number_of_equations() == len(axes)
+
+
 def test_jacobians(free):
     network = jaxbundle.add_further(
         free.network, tilts=tilts(free), tilt={"free": ["view"], "sigma": {"view": 0.1}},
