@@ -93,9 +93,8 @@ def _near_the_axis(model: CameraModel, p: Any) -> tuple[Array, tuple[Scalar, ...
     axis_point = zero, zero
     if model.own_formula == "to_ideal":
         # `to_ideal` is tested where the axis is imaged: at the measured point whose ideal one is 0.
-        nearby = [
-            -x for x in formula(p, *axis_point)
-        ]  # where there is no inverse, something is wrong there
+        # Without an inverse, at minus the ideal image of the origin, where the checks then fail.
+        nearby = [-x for x in formula(p, *axis_point)]
         axis_point = [
             jnp.where(jnp.isfinite(x), x, y)
             for x, y in zip(model.from_ideal(p, *axis_point), nearby)

@@ -51,6 +51,7 @@ def radial_spline(number: int, degrees: float) -> CameraModel:
         return X * X + Y * Y
 
     def is_inside(p: Parameters, xi: Scalar, yi: Scalar) -> Scalar:
+        # The edge belongs to the field, also where the inverse has rounded it outwards.
         return square(p, xi, yi) <= last_square * (1 + 1e-9)
 
     def radial(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:

@@ -44,9 +44,8 @@ def turning_radius(
     if model.own_formula == "to_ideal":
         radii = radius_max * t
     else:
-        # An ideal point of the image may lie far outside it
-        # Up to 200 times the half diagonal, dense near it: a barrel distortion brings far points
-        # into the image.
+        # Up to 200 times the half diagonal, dense near it: a barrel distortion brings far ideal
+        # points into the image.
         radii = radius_max * t / (1.005 - t)
     determinant, measured = map(
         np.asarray, _determinant_along(model, p, azimuth[:, None], radii[None, :])

@@ -205,12 +205,12 @@ def _status(
     middle = (jnp.asarray(shape[::-1]) - 1) / 2
     h = n // 2
     corners = jnp.asarray([[-h, h, h, -h], [-h, -h, h, h], [1, 1, 1, 1]], affine.dtype)
-    reach = jnp.max(jnp.abs(affine @ corners - middle[:, None]), 1)
+    farthest = jnp.max(jnp.abs(affine @ corners - middle[:, None]), 1)
     shift = jnp.linalg.norm(affine[:, 2] - start[:, 2])
     area = jnp.linalg.det(affine[:, :2]) / jnp.linalg.det(start[:, :2])
     reasons = (
         (~textured, MatchingStatus.NO_TEXTURE),
-        (jnp.any(reach > middle), MatchingStatus.OUTSIDE),
+        (jnp.any(farthest > middle), MatchingStatus.OUTSIDE),
         (
             # So written that NaN counts, too.
             ~((shift < settings.max_shift * n) & (area > settings.min_scale)),

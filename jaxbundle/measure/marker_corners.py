@@ -111,7 +111,8 @@ def fit_marker_corners(
         blur_before, blur = blur, np.repeat(np.median(own_blur, axis=1), 4).reshape(own_blur.shape)
         is_lost = ~_is_near(xy, approximate)
         xy[is_lost] = approximate[is_lost]
-    # Where the cells are narrow, or the blur was not the expected one, once more from there.
+    # Where the cells are narrow, or the blur was not the expected one, once more from there: with τ
+    # larger by a fifth `clearance` leaves 1.4 % of the contrast of adjacent edges instead of 0.4 %.
     strip = np.minimum(edges.inner, edges.outer).min(1).reshape(number, 4)
     needs_repeat = (
         (np.abs(np.log(blur / blur_before)) > 0.2) | (strip < settings.wide_strip * blur)
@@ -467,6 +468,8 @@ def _intersect(
         A = np.where(parallel[..., None, None], np.eye(2), A)
         inverse_A = np.linalg.inv(A)
         step = np.einsum("mkis,mks->mki", inverse_A, f)
+        # Corners are known to a few pixels: longer steps are those of sides that were not found,
+        # whose corners `_is_near` refuses.
         xy = xy - np.clip(step, -10, 10)
     variance = np.einsum("mksi,mksij,mksj->mks", powers, Q, powers)
     covariance = np.einsum("mkis,mks,mkjs->mkij", inverse_A, variance, inverse_A)

@@ -30,9 +30,10 @@ class BlobSettings:
     **Fields:**
 
     - `dark`: darker than their surroundings.
-    - `min_level`: of the strongest signal in all frames, above which a pixel belongs to a marker.
-      Distance and motion blur weaken a marker; a person who moves it is weaker still than retro
-      reflecting or shining ones. Larger: far markers are lost; smaller: more blobs to tell apart.
+    - `min_level`: of the strongest signal in the `sampled` frames, above which a pixel belongs to a
+      marker. Distance and motion blur weaken a marker; a person who moves it is weaker still than
+      retro reflecting or shining ones. Larger: far markers are lost; smaller: more blobs to tell
+      apart.
     - `max_area_misfit`: of the number of pixels of a blob relative to the area of its ellipse of
       inertia. By the raster alone a cross of five pixels has 0.18, a square 0.05.
     - `max_blobs`: in a frame; with more, such as after a lamp was switched, it is not used.

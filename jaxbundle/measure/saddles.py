@@ -153,7 +153,8 @@ class _Windows:
         height, width = grey.shape
         is_inside = np.all((place >= 0) & (place < [width, height]), axis=2)
         column, row = np.where(is_inside[..., None], place, 0).astype(int).transpose(2, 0, 1)
-        # Single precision is faster by half, and exact to 1e-5 pixels.
+        # Single precision is faster by half. It rounds a place of some thousand pixels to 0.0002:
+        # σ of a corner is 0.005 and more.
         g, place = grey[row, column].astype(np.float32), place.astype(np.float32)
         return cls(
             place, g, is_inside, half_window, None if strips is None else strips.astype(np.float32)
@@ -200,7 +201,9 @@ def _fit(
         r = windows.grey - model
         N, b = normal_equations(J, r, weight, prior, reference - theta, noise)
         d = np.linalg.solve(N, b[..., None])[..., 0]
-        # Gauss-Newton with bounded steps: beyond τ, here 0.7 of it, the model is not linear
+        # Gauss-Newton with bounded steps: beyond τ, here 0.7 of it, the model is not linear. Lines
+        # turn by 0.2 rad, levels change by 100 grey values, τ by a factor of 1.5, the light by 10 %
+        # a pixel at most.
         limit = [0.7, 0.7, 0.2, 0.2, 100, 100, 0.4, 0.1, 0.1]
         theta = theta + np.clip(d, np.negative(limit), limit)
         theta[:, 6] = np.clip(theta[:, 6], np.log(settings.min_blur), np.log(settings.max_blur))

@@ -66,15 +66,15 @@ def find_tags(cv2: ModuleType, grey: Grey, board: Board) -> BoardPoints:
         (_read_tags(grey, board, bits) for bits in BORDER_BITS),
         key=lambda numbers_and_corners: len(numbers_and_corners[0]),
     )
-    rows, columns = np.divmod(ids - board.first_marker, board.columns)
-    if len(ids) < MIN_TAGS or not (np.ptp(rows) and np.ptp(columns)):
+    tag_row, tag_column = np.divmod(ids - board.first_marker, board.columns)
+    if len(ids) < MIN_TAGS or not (np.ptp(tag_row) and np.ptp(tag_column)):
         raise InputError(
             f"fewer than {MIN_TAGS} tags of a grid of {board.columns} × {board.rows} tags "
             f"({board.dictionary}), or only of one row, found"
         )
-    for place in (board.rows - 1 - rows, rows):  # from the bottom, from the top
+    for place in (board.rows - 1 - tag_row, tag_row):  # from the bottom, from the top
         # Points of the board that are the corners of the tags, by their row from the top.
-        i, j = 2 * place[:, None] + [0, 0, 1, 1], 2 * columns[:, None] + [0, 1, 1, 0]
+        i, j = 2 * place[:, None] + [0, 0, 1, 1], 2 * tag_column[:, None] + [0, 1, 1, 0]
         corners: Int[np.ndarray, "tags 4"] = i * 2 * board.columns + j
         expected = _places(cv2, board.points[corners, :2], corners_seen)
         if expected is not None:

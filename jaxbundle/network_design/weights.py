@@ -91,6 +91,7 @@ def select(
     square, slope = np.exp(value), np.exp(value) * slope
     lowest = square + np.sort(slope)[:photographs].sum() - slope @ weight
     bound = float(np.sqrt(max(lowest, 0.0))) if pairs.aim.convex else 0.0
+    # A weight at its lower bound, which SLSQP meets to its tolerance, is that of none.
     return Selection(
         np.where(weight > 10 * IDLE_WEIGHT, weight, 0.0),
         is_chosen,

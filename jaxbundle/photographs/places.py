@@ -118,6 +118,7 @@ def to_map(
                 "the other way round: expected X (easting), then Y (northing)"
             )
         return X, f"EPSG:{code}" if code else crs.to_string()
+    # Longitudes count from −180° or from 0°: up to 360.
     outside = (abs(X[:, 1]) > 90) | (abs(X[:, 0]) > 360)
     for longitude, latitude, _ in X[outside]:
         raise InputError(

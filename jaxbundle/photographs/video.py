@@ -78,6 +78,7 @@ def look_at_video(path: Path, settings: FrameSettings, progress: Progress) -> Vi
             # Of the same view at another exposure it is the same; blur does not change the mean.
             sharpness.append(cv2.Laplacian(small, cv2.CV_32F).var() / max(small.mean(), 1.0) ** 2)
             tiny = _reduce(small, settings.thumbnail).ravel()
+            # Of less contrast than a grey value noise would count as change.
             thumbnails.append((tiny - tiny.mean()) / max(float(tiny.std()), 1.0))
             if len(sharpness) % 32 == 0:
                 progress(f"frames of {path.name}", min(len(sharpness), frame_count), frame_count)

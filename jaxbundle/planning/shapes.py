@@ -51,7 +51,7 @@ class HeightField:
         if self.bounds is None or self.steepest is None:
             # Half and double change no ray. Of hills of eleven waves across, 64 samples a side
             # underestimate the steepest slope by 13 %, 256 by 1.5 %; 1.3 covers up to about fifty
-            # waves.
+            # waves. The small constants are for a level plane, which has no range and no slope.
             samples, allowance = 256, 1.3
             x, y = np.linspace(west, east, samples), np.linspace(south, north, samples)
             Z = self.height(*np.meshgrid(x, y))
@@ -147,6 +147,7 @@ class HeightField:
             )
         usable = np.isfinite(d).all(1) & (entry >= 0) & np.isfinite(entry)
         t = np.full(len(d), np.inf)
+        # Before the upper bound, so that a summit that touches it is met from above.
         t[usable] = np.maximum(start, entry - 1e-3 * relief)[usable]
         offset, growth = np.broadcast_to(offset, len(d)), np.broadcast_to(growth, len(d))
         exit_length = exit_length + relief

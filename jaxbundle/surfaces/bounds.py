@@ -39,8 +39,10 @@ def bounds_from_points(
     if len(X) < 5:
         return None
     # Without the extremes, which may be wrong points. The margin is wide, a third of the range and
-    # more, since a few tie points miss the highest and lowest parts of a surface; q stays positive.
-    # Larger: more time and more false matches; smaller: parts of the surface are lost.
+    # more, since a few tie points miss the highest and lowest parts of a surface; of a flat one,
+    # which has no range, it is 5 % of the distance. q stays positive: up to five times the greatest
+    # distance is searched. Larger: more time and more false matches; smaller: parts of the surface
+    # are lost.
     low, high = np.percentile(view.parameter(X), [1, 99])
     margin = 0.35 * (high - low) + 0.05 * abs(high)
     return max(low - margin, 0.2 * low if low > 0 else -np.inf), high + margin

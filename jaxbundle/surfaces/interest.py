@@ -64,7 +64,8 @@ def _find_edges(eight: UInt8[np.ndarray, "rows columns"], step: int) -> Float[np
     cv2 = need_opencv()
     smooth = cv2.GaussianBlur(eight, (0, 0), 1.0)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    # 15 % of all pixels may begin an edge, which continues down to 40 % of that gradient
+    # 15 % of all pixels may begin an edge, which continues down to 40 % of that gradient; one grey
+    # value more, since most of an image without texture has the gradient 0.
     strong = float(np.percentile(slope, 85)) + 1.0
     v, u = np.nonzero(cv2.Canny(smooth, 0.4 * strong, strong))
     _, first_of_cell = np.unique(np.stack([v // step, u // step], 1), axis=0, return_index=True)

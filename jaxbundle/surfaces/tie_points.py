@@ -345,6 +345,7 @@ def _near_the_curve(
         x = np.linalg.lstsq(A[is_kept], distance[is_kept], rcond=None)[0]
         remainder = np.where(good, distance - A @ x, np.nan)
         remainder -= np.median(remainder[is_kept])
+        # At least a thousandth of a pixel: without noise the limit would be that of rounding.
         limit = settings.max_deviation * max(robust_sigma(remainder[is_kept]), 1e-3)
         with np.errstate(invalid="ignore"):
             is_kept = good & (np.abs(remainder) < limit)
