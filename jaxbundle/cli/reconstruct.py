@@ -73,6 +73,12 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
         typer.Option("--camera-per-folder", help="every folder has a camera of its own"),
     ] = False,
     angle_unit: Annotated[str, choice(ANGLE_UNIT_NAMES, "of the results")] = "deg",
+    unit: Annotated[
+        str,
+        typer.Option(
+            help="of --distances, and of the results where they give the scale: mm, in, …"
+        ),
+    ] = "m",
     correlated: Correlated = True,
     json: Json = "",
     html: Html = "",
@@ -141,6 +147,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             square_pixels=square_pixels,
             camera_per_folder=camera_per_folder,
             angle_unit=angle_unit,
+            unit=unit,
             correlated=correlated,
             store=store,
             progress=tell,
@@ -157,6 +164,7 @@ def reconstruct_command(  # noqa: PLR0913 - the options of the command
             "--points": points,
             "--no-square-pixels": True if not square_pixels else None,
             "--angle-unit": angle_unit,
+            "--unit": unit,
             "--no-correlated": True if not correlated else None,
             **judged.settings,
         },

@@ -37,6 +37,7 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
     square_pixels: bool = True,
     camera_per_folder: bool = False,
     angle_unit: str | None = None,
+    unit: str | None = None,
     correlated: bool = True,
     settings: ReconstructionSettings = DEFAULT,
     store: str | Path | None = None,
@@ -61,7 +62,8 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
       `settings`.
     - `square_pixels`: observe fy/fx as 1; otherwise both focal lengths are unknown.
     - `camera_per_folder`: photographs of two folders were taken with two cameras.
-    - `angle_unit` of the results: `"deg"`, `"gon"` or `"rad"`.
+    - `angle_unit` of the results: `"deg"`, `"gon"` or `"rad"`; `unit` of the distances, and of the
+      results where they alone give the scale: `"m"`, `"mm"`, `"in"`, …
     - `correlated`: state σ under errors that image points share, and compare halves by photographs,
       of eight photographs or more (`Adjustment.error_model`, `Adjustment.replication`).
     - `store`: folder of features and matches, for a repeated run.
@@ -81,6 +83,8 @@ def reconstruct(  # noqa: PLR0913 (public: the options of the command, all but o
         settings = replace(settings, camera_per_folder=True)
     if angle_unit is not None:
         settings = replace(settings, angle_unit=angle_unit)
+    if unit is not None:
+        settings = replace(settings, unit=unit)
     if truth("uncoded", uncoded):
         settings = replace(settings, uncoded=True)
     if pairs is not None:

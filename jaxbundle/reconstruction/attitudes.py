@@ -58,7 +58,8 @@ def with_attitudes(
     cosine = (np.einsum("nij,nij->n", M, oriented) - 1) / 2
     deviation = np.arccos(np.clip(cosine, -1, 1))
     # Angles of right attitudes with σ about three axes have the median 1.54 σ; one constant
-    # rotation, as of a mounting, makes all of them large.
+    # rotation, as of a mounting, makes all of them large. With the limit 3, σ may be stated 1.9
+    # times too small.
     if np.median(deviation / sigma) > 3:
         return network, (
             f"attitudes in the files are off by {np.degrees(np.median(deviation)):.0f} degrees "

@@ -198,7 +198,7 @@ def describe_block(result: Adjustment, exif: Mapping[str, Exif], system: str) ->
         system
         or (
             "local, to scale"
-            if network.object_unit == "m"
+            if network.object_unit != "unit"
             else "arbitrary: neither control, satellite positions nor scale bars"
         ),
         network.object_unit,

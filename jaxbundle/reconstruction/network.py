@@ -23,13 +23,14 @@ from jaxbundle.tiepoints.track_measurement import Measurements
 @dataclasses.dataclass(frozen=True)
 class FurtherData:
     """Further data of a network: named points including control, distances between
-    them; positions of the photographs with their σ, and attitudes. (Coordinates of control:
-    `georeferencing`.)"""
+    them; positions of the photographs with their σ, and attitudes; the `unit` that distances and
+    positions give the network. (Coordinates of control: `georeferencing`.)"""
 
     named: NamedMeasurements
     distances: tuple[dict, ...] = ()
     positions: tuple[np.ndarray, np.ndarray] | None = None
     attitudes: MapAttitudes | None = None
+    unit: str = "m"
 
 
 def photograph_network(
@@ -84,7 +85,7 @@ def photograph_network(
         # Positions give frame and scale; without them inner constraints define the frame, and scale
         # bars the scale.
         datum="inner" if extra.positions is None else "control",
-        object_unit="m" if distances or extra.positions is not None else "unit",
+        object_unit=extra.unit if distances or extra.positions is not None else "unit",
     )
     # Of the photograph whose window is matched in the others.
     tracks, colours = measured.track[measured.is_template], measured.colour[measured.is_template]

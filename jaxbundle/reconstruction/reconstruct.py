@@ -19,6 +19,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.units import METRES
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.concurrent import photographs_at_once
@@ -103,8 +104,8 @@ def reconstruct(
     **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, shared by
     all; `store`: folder for features and matches; `progress(stage, done, total)`;
     `control`: points with coordinates, by the names of coded targets or measured in photographs;
-    `distances`: rows `from`, `to`, `value`, `sigma` between named points, metres; `name` of the
-    result, default: of the first folder.
+    `distances`: rows `from`, `to`, `value`, `sigma` between named points, in `settings.unit`;
+    `name` of the result, default: of the first folder.
 
     **Raises:** `InputError` if the photographs cannot be used; `NotSolvedError` if no two of
     them can be oriented.
@@ -137,11 +138,17 @@ def reconstruct(
         named_measurements = named_measurements.take(
             np.array([id not in checks for id in named_measurements.name], bool)
         )
+    unit = settings.unit
+    if framed or control is not None:
+        metres = METRES[unit]
+        scaled = lambda row: {name: metres * row[name] for name in ("value", "sigma")}
+        distances, unit = [{**row, **scaled(row)} for row in distances], "m"
     further_data = FurtherData(
         named_measurements,
         tuple(distances),
         positions[:2] if positions and framed else None,
         attitudes,
+        unit,
     )
     system = "" if control is None else control.system
     # Control whose file names no system is in that of the positions: `find_positions` has dropped

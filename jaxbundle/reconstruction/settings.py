@@ -6,6 +6,7 @@ from jaxbundle.arguments import integer, one_of
 from jaxbundle.choices import MATCHED_PAIRS
 from jaxbundle.errors import InputError
 from jaxbundle.network.rules import CHOICES, check_choice
+from jaxbundle.network.units import METRES
 from jaxbundle.reconstruction.adjusting import WeightingSettings
 from jaxbundle.reconstruction.folding import SuperpositionSettings
 from jaxbundle.reconstruction.oriented_block import ControlSettings
@@ -40,6 +41,9 @@ class ReconstructionSettings:
     """Significance of data snooping: the probability that a good measurement is removed."""
     angle_unit: str = "deg"
     """Unit of the angles of the result and their σ: "deg", "gon" or "rad"."""
+    unit: str = "m"
+    """Unit of distances, and of the result where they alone give the scale; positions and control
+    are in metres."""
     camera_per_folder: bool = False
     """The photographs of every folder have a camera of their own. Otherwise those of one make,
     model, serial number, focal length and size share one."""
@@ -81,6 +85,7 @@ class ReconstructionSettings:
         one_of("pairs", self.pairs, MATCHED_PAIRS)
         integer("points", self.points)
         check_choice("angle_unit", self.angle_unit, CHOICES["angle_unit"])
+        one_of("unit", self.unit, tuple(METRES))
         if not self.natural_points and self.targets is None:
             raise InputError(
                 "features none: coded targets alone connect the photographs; give targets, such as "

@@ -10,6 +10,7 @@ import pytest
 from jaxbundle import Camera
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.tables import Images
+from jaxbundle.photographs.places import MapPositions
 from jaxbundle.reconstruction import reconstruct, square_pixels
 from jaxbundle.reconstruction.named import NamedMeasurements, no_named_points
 from jaxbundle.reconstruction.network import FurtherData
@@ -276,3 +277,30 @@ def test_parts_state_errors_that_image_points_share_unless_turned_off(run, monke
     # without scale bars of its own, though another part has some
     (note,) = run.notes
     assert note.startswith("part 1: position, orientation and scale are arbitrary")
+
+
+@pytest.mark.parametrize("positions, distance, unit", [(False, 428.0, "mm"), (True, 0.428, "m")])
+def test_distances_give_the_result_their_unit_unless_positions_do(
+    monkeypatch, tmp_path, positions, distance, unit
+):
+    photographs = [
+        SimpleNamespace(name=name, exif=SimpleNamespace(attitude=None)) for name in ("a", "b")
+    ]
+    X = np.zeros((2, 3))
+    found = MapPositions(X, X + 1, np.zeros(2), "EPSG:32633", True) if positions else None
+    image, names = np.array([0, 0, 1, 1]), ("p", "q", "p", "q")
+    named = NamedMeasurements(image, names, np.zeros((4, 2)), np.ones((4, 2)))
+    monkeypatch.setattr(reconstruct, "find_photographs", lambda given: (photographs, {}))
+    monkeypatch.setattr(reconstruct, "assign_cameras", lambda *_: Cameras((), (), (), False, ()))
+    monkeypatch.setattr(reconstruct, "find_named", lambda *_: (named, None, []))
+    monkeypatch.setattr(reconstruct, "find_positions", lambda *_: (found, []))
+    monkeypatch.setattr(_ReconstructionRun, "run", lambda run: run.further)
+    bars = [{"from": "p", "to": "q", "value": 428.0, "sigma": 0.01}]
+    further = reconstruct.reconstruct(
+        [tmp_path], settings=ReconstructionSettings(unit="mm"), distances=bars
+    )
+    (bar,) = further.distances
+    assert bar["value"] == pytest.approx(distance) and further.unit == unit
+    assert bar["sigma"] / bar["value"] == pytest.approx(0.01 / 428.0)
+    with pytest.raises(InputError, match="unit must be one of nm, um"):
+        ReconstructionSettings(unit="parsec")
