@@ -9,6 +9,7 @@ from further_checks import check_jacobians, sample
 import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.network.build import make_further
 
 N, SIGMA = 6, 1e-4
 AXIS = {"right": np.array([1.0, 0, 0]), "up": np.array([0, 1.0, 0]), "view": np.array([0, 0, -1.0])}
