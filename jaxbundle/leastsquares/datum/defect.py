@@ -180,6 +180,8 @@ def make_datum(
         orthonormal = np.linalg.inv(R) / size[:, None]
         gauge, directions = gauge @ orthonormal, [rows @ orthonormal for rows in directions]
     if minimal:
+        # Any independent ones hold the datum. In their own units, unlike pins: coordinates, whose
+        # motions are the largest numbers, come before angles.
         picked = _pick_rows(np.concatenate(directions), np.concatenate(candidates))
         cuts = np.cumsum([w.size for w in weight.values()])[:-1]
         weight = {
