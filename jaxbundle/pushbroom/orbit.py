@@ -40,10 +40,11 @@ def state_orbit(
     times, position = np.asarray(times, float), np.asarray(position, float)
     spin = np.array([0.0, 0.0, EARTH_RATE])
     start = np.r_[position, np.asarray(velocity, float) + np.cross(spin, position)]
-    if not np.linalg.norm(position) > RADIUS / 2:
+    # As for the orbit (`_ground`).
+    if not np.linalg.norm(position) > RADIUS:
         raise InputError(
-            f"state: the position is {np.linalg.norm(position):.6g} m from the centre of the Earth;"
-            " metres, Earth-fixed or in the stated frame, are expected"
+            f"state: the position is {np.linalg.norm(position):.6g} m from the centre of the Earth,"
+            " below the ground; metres, Earth-fixed or in the stated frame, are expected"
         )
     states = np.empty((len(times), 6))
     tolerance = 1e-12  # relative: 1e-5 m in a revolution
@@ -62,6 +63,11 @@ def state_orbit(
             atol=tolerance * np.r_[np.full(3, 1e7), np.full(3, 1e4)],
             events=_ground,
         )
+        if solution.status < 0:
+            raise InputError(
+                "state: the orbit cannot be computed; check position and velocity, their unit and "
+                "frame"
+            )
         if solution.status:
             raise InputError(
                 f"state: the orbit reaches the ground at {solution.t_events[0][0]:.6g} s; check "

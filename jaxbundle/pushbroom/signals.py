@@ -18,6 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean, refuse_unknown
+from jaxbundle.types import Numbers
 
 Times = Float[np.ndarray, " n"]
 
@@ -39,7 +40,8 @@ def signal(
     **Arguments:** `description` a number, or `{"kind": …}` with the keys of the kind; missing ones
     are 0 (period or step 1 s). A walk draws from `rng`.
 
-    **Raises:** `InputError` for unknown kinds and keys, periods and steps that are not positive.
+    **Raises:** `InputError` for unknown kinds and keys, periods and steps that are not positive,
+    tables that are none or do not cover t.
     """
     if isinstance(description, int | float):
         return np.full(len(t), float(description))
@@ -64,8 +66,27 @@ def signal(
         case "walk":
             return get("value") + _walk(elapsed, get("sigma"), get("step", 1.0), rng)
         case "table":
-            return CubicSpline(description["times"], description["values"], extrapolate=False)(t)
+            return _interpolated(t, *(description.get(key, ()) for key in KEYS["table"]))
     return np.full(len(t), get("value"))
+
+
+def _interpolated(t: Times, times: Numbers, values: Numbers) -> Times:
+    """The cubic spline through a table, at times t that it covers."""
+    times, values = np.asarray(times, float), np.asarray(values, float)
+    if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
+        raise InputError(
+            f"signal 'table': {times.size} times and {values.size} values; expected as many of "
+            "both, two at least"
+        )
+    if not (np.isfinite(values).all() and (np.diff(times) > 0).all()):
+        raise InputError("signal 'table': expected times that increase, and finite values")
+    if t.min() < times[0] or t.max() > times[-1]:
+        raise InputError(
+            f"signal 'table': times from {times[0]:.9g} to {times[-1]:.9g} s; expected from "
+            f"{t.min():.9g} s or before to {t.max():.9g} s or after, as far as the records of the "
+            "instrument reach beyond the image"
+        )
+    return CubicSpline(times, values)(t)
 
 
 def _walk(elapsed: Times, sigma: float, step: float, rng: np.random.Generator) -> Times:

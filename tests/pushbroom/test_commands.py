@@ -11,6 +11,8 @@ from scipy.ndimage import binary_erosion
 from test_simulate_correct import pattern
 
 from jaxbundle import cli
+from jaxbundle.errors import InputError
+from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.writing.folders import MARKER
 
 ROOT = Path(__file__).parents[2]
@@ -66,6 +68,13 @@ def flight(tmp_path):
     path = tmp_path / "flight.toml"
     path.write_text(FLIGHT)
     return path
+
+
+@pytest.mark.parametrize("seed", ["1.7", "-1"])
+def test_a_seed_is_a_whole_number(flight, seed):
+    flight.write_text(FLIGHT.replace("seed = 3", f"seed = {seed}"))
+    with pytest.raises(InputError, match=rf"\[simulation\]: seed is {seed}"):
+        read_flight(flight)
 
 
 def write_scene(path):

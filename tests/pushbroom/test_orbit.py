@@ -89,6 +89,7 @@ def test_a_flight_from_a_state():
 
 @pytest.mark.parametrize("old, new, words", [
     ("6000000.0, ", "6.0, ", ["[position]", "centre of the Earth"]),
+    ("6000000.0, ", "6000000.0, ", ["[position]", "6e+06 m", "below the ground"]),
     ("7500.0", "0.0", ["[position]", "reaches the ground"]),
     ("[-6.0, 11.0]", "[11.0, -6.0]", ["[position]", "forward"]),
     ("state", "stat", ["'stat'", "'state'"]),

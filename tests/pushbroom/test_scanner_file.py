@@ -61,7 +61,9 @@ def test_an_orbit_instead_of_a_table(tmp_path):
         f"node = {float(np.degrees(1.9))!r}, argument = {float(np.degrees(0.1))!r} }}\n"
     )
     text = TEXT.replace('table = "positions.csv"\n', circle)
-    assert_same_image(read_scanner(write_scanner(tmp_path, text)).image)
+    image = read_scanner(write_scanner(tmp_path, text)).image
+    assert_same_image(image)
+    assert image.trajectory.position.times[-1] == 11  # the end of the span is a row
 
 
 BROKEN = {
@@ -80,6 +82,19 @@ BROKEN = {
     "local frame": ('ions.csv"', 'ions.csv"\nframe = "local"', ["[position]", 'earth = "local"']),
     "interpolation": ('ude.csv"', 'ude.csv"\ninterpolation = "slurp"', ["did you mean 'slerp'"]),
     "angles": ("yaw", "jaw", ["[mounting]", "'jaw'", "'yaw'"]),
+    "a key of orbits": ('ions.csv"', 'ions.csv"\nspan = [0, 1]', ["[position]", "key 'span'"]),
+    "two ways of times": ("period", 'table = "t.csv"\nperiod', ["[times]", "key 'period'"]),
+    "fraction": ('ions.csv"', 'ions.csv"\norder = 7.9', ["[position]", "order is 7.9", "whole"]),
+    "misspelt circle": (
+        'table = "positions.csv"', "circle = { height = 5e5, inclinaton = 98 }\nspan = [-6, 11]",
+        ["[position]", "circle", "did you mean 'inclination'"],
+    ),
+    "no circle": ('table = "positions.csv"', "circle = 5\nspan = [-6, 11]", ["circle is 5"]),
+    "no elements": ('table = "positions.csv"', "tle = [1, 2]\nspan = [0, 9]", ["tle", "quotes"]),
+    "no width": (
+        TEXT[TEXT.index("model =") : TEXT.index("[mount")],
+        "across = [0, 1]\nalong = [0]\nhalf = 0\n", ["[optics]", "half is 0"],
+    ),
 }  # fmt: skip
 
 
@@ -92,6 +107,17 @@ def test_what_is_wrong_in_a_file(tmp_path, case):
         read_scanner(path)
     for word in words:
         assert word in str(refused.value), refused.value
+
+
+@pytest.mark.parametrize("old, new, words", [
+    ('ude.csv"', 'ude.csv"\nframe = "orbit"', r"\[attitude\]: frame is 'orbit', earth is local"),
+    ('table = "positions.csv"', "circle = { height = 5e5 }\nspan = [0, 9]", "circle: an orbit is"),
+])  # fmt: skip
+def test_an_orbit_needs_the_earth(tmp_path, old, new, words):
+    """In a local frame the direction from its origin is no vertical."""
+    local = TEXT.replace('name = "test"', 'earth = "local"')
+    with pytest.raises(InputError, match=words):
+        read_scanner(write_scanner(tmp_path, local.replace(old, new)))
 
 
 KINDS = "Community Sensor Model (.json)", "DIMAP", "DigitalGlobe (.xml, .imd)"

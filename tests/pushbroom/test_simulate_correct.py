@@ -47,6 +47,13 @@ def test_signals():
     one, part = (signal({"kind": "walk", "sigma": 1.0}, times, 0.0, np.random.default_rng(7))
                  for times in (t, t[::3]))  # fmt: skip
     np.testing.assert_allclose(one[::3], part, atol=1e-12)
+    for times, values, words in (
+        (None, t, "0 times and 50 values"), (t[1:], t, "49 times and 50 values"),
+        (t[::-1], t, "times that increase"), (t[:-1], t[:-1], "to 10 s or after"),
+    ):  # fmt: skip
+        given = {"values": values} | ({} if times is None else {"times": times})
+        with pytest.raises(InputError, match=words):
+            of(kind="table", **given)
     with pytest.raises(InputError, match="did you mean 'sine'"):
         of(kind="sin")
     with pytest.raises(InputError, match="did you mean 'amplitude'"):
@@ -63,6 +70,14 @@ AIRCRAFT = Flight(
     },
     attitude_rate=8.0,
 )  # fmt: skip
+
+
+def test_the_interpolation_of_a_straight_track_is_that_given():
+    for method in ("linear", "spline"):
+        flight = dataclasses.replace(AIRCRAFT, position_interpolation=method)
+        assert measured_image(flight).trajectory.position.method == method
+    with pytest.raises(InputError, match="did you mean 'spline'"):
+        measured_image(dataclasses.replace(AIRCRAFT, position_interpolation="splin"))
 
 
 def pattern(x, y):

@@ -109,7 +109,7 @@ def read_flight(path: str | Path) -> FlightFile:
         },
         mounting_of(file),
         noise=Noise(*(_sigma(noise, name, file.radians) for name in Noise._fields)),
-        seed=int(file.section("simulation").number("seed", 0)),
+        seed=file.section("simulation").integer("seed", 0, at_least=0),
         **options,
     )
     return FlightFile(file, flight, earth)

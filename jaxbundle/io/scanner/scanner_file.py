@@ -21,7 +21,7 @@ extrapolate = 0.0                   # seconds beyond the ends of the table
 
 [attitude]
 table = "attitude.csv"              # t,q0,q1,q2,q3 (scalar first) or t,pitch,roll,yaw
-frame = "ITRF"                      # as of positions, or "orbit"
+frame = "ITRF"                      # as of positions, or "orbit" with an Earth
 interpolation = "slerp"             # slerp | linear | lagrange | usgscsm | spline
 
 [optics]                            # a camera model's parameters, or table, or across and along
@@ -88,7 +88,15 @@ from jaxbundle.pushbroom.trajectory import AttitudeTable, Trajectory
 FRAMES = (*frames.FRAMES, "local")
 ANGLES = ("pitch", "roll", "yaw")
 INTERPOLATION = ("interpolation", "order", "gap", "extrapolate")
-KINDS = ("table", "tle", "circle", "state")
+CIRCLE = ("height", "inclination", "node", "argument")
+# Of each way to give the positions, the keys that go with it.
+ROWS = ("span", "step", *INTERPOLATION)
+KINDS = {
+    "table": ("frame", *INTERPOLATION),
+    "tle": ROWS,
+    "circle": ROWS,
+    "state": ("at", "j2", "frame", *ROWS),
+}
 SECTIONS = {
     "scanner": (
         "name",
@@ -103,7 +111,7 @@ SECTIONS = {
         "corrections",
     ),
     "times": ("first", "period", "table"),
-    "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
+    "position": (*KINDS, "at", "j2", "frame", *ROWS),
     "attitude": ("table", "frame", *INTERPOLATION),
     "optics": (),  # depends on its kind
     "mounting": ANGLES,
@@ -123,7 +131,7 @@ def scanner_of(file: TomlFile) -> ScannerInput:
     check_size(lines, pixels, scanner.where.removesuffix(": "))
     earth = earth_of(scanner)
     position, positions = _position(file, earth)
-    attitude, attitudes, lengths = _attitude(file, earth)
+    attitude, attitudes, length_warnings = _attitude(file, earth)
     mounting = mounting_of(file)
     switches = file.section("corrections")
     corrections = Corrections(*(switches.switch(name) for name in Corrections._fields))
@@ -139,7 +147,7 @@ def scanner_of(file: TomlFile) -> ScannerInput:
         corrections,
         (positions, attitudes),
     )
-    return ScannerInput(scanner.text("name", file.path.stem), image, earth, lengths)
+    return ScannerInput(scanner.text("name", file.path.stem), image, earth, length_warnings)
 
 
 def _orientation(file: TomlFile) -> frames.EarthOrientation:
@@ -162,7 +170,7 @@ def _options(section: TomlSection, method: str) -> dict[str, Any]:
     """Interpolation, order, gap, extrapolation."""
     options: dict[str, Any] = {"method": section.text("interpolation", method)}
     if "order" in section:
-        options["order"] = int(section.number("order"))
+        options["order"] = section.integer("order", at_least=1)
     if "gap" in section:
         options["gap"] = section.number("gap")
         if options["gap"] <= 0:
@@ -215,10 +223,12 @@ def earth_of(scanner: TomlSection) -> Ellipsoid | None:
 def _times(file: TomlFile, lines: int) -> LineTimes:
     section = file.section("times")
     if "table" not in section:
+        section.check_keys(("first", "period"))
         period = section.number("period")
         if period <= 0:
             raise InputError(f"{section.where}period is {period}; expected a positive number")
         return LineTimes(jnp.asarray(section.number("first", 0.0)), jnp.asarray(period))
+    section.check_keys(("table",))
     columns = section.table()
     columns.check_names(("t",), ("line",))
     t = columns.numbers("t", required=True)
@@ -238,8 +248,8 @@ def _frame(section: TomlSection, earth: Ellipsoid | None, allowed_frames: Sequen
         raise InputError(
             f"{section.where}unknown frame {frame!r}{did_you_mean(frame, allowed_frames)}"
         )
-    # Attitudes against the orbit are given without an Earth, too.
-    if (earth is None) != (frame == "local") and frame != "orbit":
+    # The orbital frame, too: its vertical leads to the centre of the Earth.
+    if (earth is None) != (frame == "local"):
         raise InputError(
             f"{section.where}frame is {frame!r}, earth is {'local' if earth is None else 'given'}; "
             'a local frame belongs to [scanner] earth = "local", and no other does'
@@ -252,6 +262,7 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[TimeTable, Sourc
     kinds = [kind for kind in KINDS if kind in section]
     if len(kinds) != 1:
         raise InputError(f"{section.where}give one of {', '.join(KINDS)}, not {kinds}")
+    section.check_keys((kinds[0], *KINDS[kinds[0]]))
     if kinds != ["table"]:
         return _orbit(file, section, kinds[0], earth)
     frame = _frame(section, earth, FRAMES)
@@ -289,6 +300,11 @@ def _orbit(
     file: TomlFile, section: TomlSection, kind: str, earth: Ellipsoid | None
 ) -> tuple[TimeTable, Source]:
     """Two-line elements, a circle, a state: as a table for interpolation."""
+    if earth is None:
+        raise InputError(
+            f'{section.where}{kind}: an orbit is about the Earth, but [scanner] earth is "local"; '
+            "give a table of positions"
+        )
     start, end = section.numbers("span", 2)
     step = section.number("step", 1.0)
     max_steps = 1_000_000  # 50 MB of states: more is a mistake in the span or the step
@@ -297,11 +313,13 @@ def _orbit(
             f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; expected 1 "
             f"to {max_steps} steps forward"
         )
-    t = np.arange(start, end, step)
+    # The last row is at the end of the span.
+    t = np.linspace(start, end, 1 + math.ceil((end - start) / step))
     if kind == "tle":
         lines = section.values["tle"]
-        if not (isinstance(lines, list) and len(lines) == 2):
-            raise InputError(f"{section.where}tle: expected a list of the two lines")
+        is_list = isinstance(lines, list) and len(lines) == 2
+        if not (is_list and all(isinstance(line, str) for line in lines)):
+            raise InputError(f"{section.where}tle: expected a list of the two lines, in quotes")
         first_line, second_line = lines
         P, V = frames.two_line_orbit(first_line, second_line, _epoch(file), t, _orientation(file))
     elif kind == "state":
@@ -317,8 +335,15 @@ def _orbit(
         except InputError as error:
             raise InputError(f"{section.where}{error}") from None
     else:
-        circle = TomlSection(file, f"{section.where}circle: ", section.values["circle"])
-        angles = (circle.number(k, 0.0) for k in ("inclination", "node", "argument"))
+        values = section.values["circle"]
+        if not isinstance(values, dict):
+            raise InputError(
+                f"{section.where}circle is {show(values)}; expected {{ height = …, inclination = … "
+                "}"
+            )
+        circle = TomlSection(file, f"{section.where}circle: ", values)
+        circle.check_keys(CIRCLE)
+        angles = (circle.number(k, 0.0) for k in CIRCLE[1:])
         angles = [file.radians * angle for angle in angles]
         P, V = frames.circular_orbit(t, circle.number("height"), *angles)
     source = Source(f"{section.where}span")
@@ -337,9 +362,9 @@ def _attitude(
     columns.check_names(("t", *names))
     t = columns.numbers("t", required=True)
     values = np.stack([columns.numbers(n, required=True) for n in names], 1)
-    lengths: tuple[str, ...] = ()
+    length_warnings: tuple[str, ...] = ()
     if quaternions:
-        values, lengths = normalise_quaternions(values, columns.source)
+        values, length_warnings = normalise_quaternions(values, columns.source)
     else:
         values = file.radians * values
         if (is_more := np.abs(values) > FULL_TURN).any():
@@ -359,7 +384,7 @@ def _attitude(
         reference="orbit" if frame == "orbit" else "earth",
         source=columns.source,
     )
-    return attitude, columns.source, lengths
+    return attitude, columns.source, length_warnings
 
 
 def optics_of(file: TomlFile, pixels: int) -> Optics:
@@ -379,6 +404,8 @@ def optics_of(file: TomlFile, pixels: int) -> Optics:
     if "across" in section:
         section.check_keys(("across", "along", "middle", "half"))
         half = section.number("half", pixels / 2)
+        if half == 0:
+            raise InputError(f"{section.where}half is 0; expected pixels, half a line of them")
         return AnglePolynomial(
             jnp.asarray(section.numbers("across")),
             jnp.asarray(section.numbers("along")),

@@ -94,11 +94,11 @@ class TomlSection:
             raise InputError(f"{self.where}{key} is {value}; expected a finite number")
         return value
 
-    def integer(self, key: str) -> int:
-        """A whole number, 2 or more."""
-        value = self._get(key, None, "a whole number, 2 or more,", (int,))
-        if value < 2:
-            raise InputError(f"{self.where}{key} is {value}; expected 2 or more")
+    def integer(self, key: str, default: int | None = None, at_least: int = 2) -> int:
+        """A whole number, 2 or more, or another least one."""
+        value = self._get(key, default, f"a whole number, {at_least} or more,", (int,))
+        if value < at_least:
+            raise InputError(f"{self.where}{key} is {value}; expected {at_least} or more")
         return value
 
     def text(self, key: str, default: str | None = None) -> str:
