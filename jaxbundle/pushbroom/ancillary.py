@@ -63,9 +63,9 @@ def position_table(
     """Positions (metres) against time (seconds).
 
     **Arguments:** `velocities` in metres a second, needed by `"hermite"`; `order` of Lagrange's
-    polynomial; `gap` the longest step that is interpolated, in seconds (five median steps);
-    `extrapolate` the seconds of allowed extrapolation (none); `source` names the rows
-    in messages.
+    polynomial (7: eight rows, as of usgscsm and the SPOT Geometry Handbook); `gap` the longest step
+    that is interpolated, in seconds (five median steps); `extrapolate` the seconds of allowed
+    extrapolation (none); `source` names the rows in messages.
 
     **Raises:** `InputError` naming the row: times that do not increase, invalid numbers, too
     few rows; a gap that is not positive.
@@ -98,8 +98,11 @@ def attitude_table(
 
     **Raises:** `InputError` naming the row, also for quaternions whose length is far from 1.
     """
-    values = np.array(values, float)
-    quaternions = values.ndim == 2 and values.shape[1] == 4
+    expected = "quaternions [rows, 4], or pitch, roll, yaw [rows, 3]"
+    values = numeric_array(source.name, values, expected).astype(float)
+    if values.ndim != 2 or values.shape[1] not in (3, 4):
+        raise InputError(f"{source.name}: attitudes of shape {values.shape}; expected {expected}")
+    quaternions = values.shape[1] == 4
     allowed_methods = tuple(m for m in (*METHODS, "slerp") if m != "hermite")
     _check_method(method, allowed_methods, source)
     if method == "slerp" and not quaternions:

@@ -35,7 +35,8 @@ from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
 
-# Positions in each piece where the speed is tested.
+# Positions in each piece where the speed is tested: its ends and thirds. Between them
+# `min_relative_speed` is the margin.
 TESTED_POSITIONS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])
 POWERS = np.array([(i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)])
 

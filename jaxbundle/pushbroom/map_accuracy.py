@@ -137,9 +137,9 @@ def _interpolate(
     height: Float[AnyArray, "*shape"],
 ) -> Float[Array, "3 *shape"]:
     axes = lattice.heights, lattice.lines, lattice.pixels
-    places = [
-        (value - axis[0]) / (axis[1] - axis[0]) for value, axis in zip((height, line, pixel), axes)
-    ]
+    # Of an image of one line all lines of the lattice are the same.
+    step = lambda axis: jnp.where(axis[1] > axis[0], axis[1] - axis[0], 1.0)
+    places = [(value - axis[0]) / step(axis) for value, axis in zip((height, line, pixel), axes)]
     # Of order 1: multilinear; half a pixel beyond the outer centres they are extended.
     interpolate_part = lambda part: jax.scipy.ndimage.map_coordinates(
         part, places, order=1, mode="nearest"

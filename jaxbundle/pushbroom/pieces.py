@@ -96,8 +96,8 @@ def make_pieces(
         piece_starts, piece_ends = piece_starts[~good], piece_ends[~good]
         if len(piece_starts) and (piece_ends - piece_starts).min() < settings.min_piece * line:
             raise InputError(
-                f"attitude: the trajectory at {piece_starts[0]:.9g} s does not follow from its "
-                f"rows within {settings.min_piece:g} lines; look for wrong rows there"
+                f"positions or attitude: the trajectory at {piece_starts[0]:.9g} s does not follow "
+                f"from their rows within {settings.min_piece:g} lines; look for wrong rows there"
             )
         middle = (piece_starts + piece_ends) / 2
         piece_starts, piece_ends = np.r_[piece_starts, middle], np.r_[middle, piece_ends]

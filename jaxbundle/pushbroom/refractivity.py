@@ -31,7 +31,7 @@ EARTH_RADIUS = 6356766.0
 # R of dry air, J/(kg·K): the standard's R* by its molar mass at sea level.
 GAS_CONSTANT = 8314.32 / 28.9644
 # (n − 1)/ρ, m³/kg: n − 1 at 15 °C, 1013.25 hPa and 0.55 µm (Ciddor, 1996, Applied Optics 35,
-# 1566–1573), where ρ is 1.225 kg/m³. At 0.48 and 0.70 µm it is 0.5 % more and less.
+# 1566–1573), where ρ is 1.225 kg/m³. It is 0.6 % more at 0.48 µm, 0.7 % less at 0.70 µm.
 REFRACTIVITY = 2.779e-4 / 1.225
 
 # Geopotential heights at which the layers begin, metres (table 4); the last is continued with

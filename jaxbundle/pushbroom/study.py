@@ -43,7 +43,7 @@ TRAJECTORIES = {
 }
 FLOORS = ("linear", "spline")
 WAYS = ("drawn", "propagated", "closed")
-# Default accuracies of attitudes, radians.
+# Default accuracies of attitudes, radians: those of the tables of Hakim et al.
 SIGMAS = (math.radians(0.01), math.radians(0.1))
 
 
@@ -200,7 +200,7 @@ def accuracy_table(
             propagated = propagate_accuracy(image, surface, line, pixel, noise)
             level = closed_form(altitude, view, sigma, sigma, sigma)
             # Above a plane, near the nadir, errors along and across are almost alike.
-            round_ = circular_error(np.eye(2) * level**2 / 2)
+            circle_ce90 = circular_error(np.eye(2) * level**2 / 2)
             erring.append(
                 Erring(
                     name,
@@ -210,7 +210,7 @@ def accuracy_table(
                     level,
                     simulated.overall_ce90,
                     propagated.overall_ce90,
-                    round_,
+                    circle_ce90,
                 )
             )
     return AccuracyTable(altitude, view, kind, draws, error_free, erring)

@@ -138,9 +138,9 @@ def make_terrain(
         raise InputError(f"terrain: heights of shape {heights.shape}; a grid of 2 × 2 at least")
     if not np.isfinite(heights).any():
         raise InputError("terrain: no valid height; give a model that covers the image")
-    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     # Infinite heights, as some files mark voids, would pass for terrain.
     heights = np.where(np.isfinite(heights), heights, np.nan)
+    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     (x, y), (dx, dy) = origin, step
     return Terrain(
         heights=jnp.asarray(heights),

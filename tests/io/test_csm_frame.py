@@ -357,6 +357,14 @@ def test_framelets_are_photographs(reverse, tmp_path):
         np.testing.assert_allclose(images(chosen, X), expected, atol=2e-6)
 
 
+def test_positions_alone_hold_for_a_step_beyond_their_ends(tmp_path):
+    isd = push_frame(starting_ephemeris_time=NOW - 1.4)  # to 5.6 s, the table to 5 s
+    expected, _ = pose(framelet_of(isd, 14))
+    isd["instrument_position"].pop("velocities")
+    net = read_csm_frame(write(tmp_path, isd))
+    np.testing.assert_allclose(net.images.position[14], expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("changes, message", [
     ({"framelets_flipped": True}, "mirror image"), ({"framelet_height": 0}, "framelet_height"),
     ({"interframe_delay": -1.0}, "interframe_delay is -1"), ({"framelet_height": 999}, "less than"),

@@ -16,6 +16,7 @@ from jaxbundle.pushbroom.error_propagation import (
     simulate_accuracy,
     spread_positions,
 )
+from jaxbundle.pushbroom.map_accuracy import CovarianceLattice, interpolate_covariances
 from jaxbundle.pushbroom.noise import Noise, add_errors, zero_errors
 from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.pushbroom.trajectory import attitude_at
@@ -113,6 +114,13 @@ def test_circular_error():
     mixed = np.quantile(np.r_[length, 0.1 * length], 0.9)
     both = np.diag([9.0, 1.0]), np.diag([0.09, 0.01])
     np.testing.assert_allclose(circular_error(np.array(both)), mixed, rtol=0.005)
+
+
+def test_a_lattice_of_one_line():
+    ends, one_line = np.array([0.0, 1.0]), np.zeros(2)
+    lattice = CovarianceLattice(ends, one_line, ends, np.full((3, 2, 2, 2), 4.0))
+    found = interpolate_covariances(lattice, one_line, ends, np.array([0.2, 0.7]))
+    np.testing.assert_allclose(found, 4)
 
 
 @pytest.mark.parametrize("cells", [(1, 1), (11, 11), (3, 4)])

@@ -195,6 +195,17 @@ def test_lines_of_two_periods(tmp_path):
     np.testing.assert_allclose(times, expected, atol=1e-12)
 
 
+def test_a_single_record_of_the_pointing(tmp_path):
+    t = 999.2 + 0.2 * np.arange(9)
+    track = np.stack([0.02 * (t - 1000), 0 * t, -1.0 + 0 * t], 1)
+    isd = small(t, track, [[0.0, 0, 0, 1]], np.tile([1.0, 0, 0, 0], (9, 1)), 0.01)
+    isd["instrument_pointing"]["ephemeris_times"] = [999.5]
+    isd["line_scan_rate"] = [[0.5, -0.4, 0.05]]
+    R = [np.asarray(pose_at(read_csm(write(tmp_path, isd), how).image, 0.0).R)
+         for how in ("usgscsm", "lagrange")]  # fmt: skip
+    np.testing.assert_allclose(*R, atol=1e-12)
+
+
 def changed(path, value):
     def change(isd):
         *parents, last = path.split(".")

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io import read_scanner
 from jaxbundle.io.scanner.csm_writing import write_csm_state
+from jaxbundle.io.scanner.writing import write_scanner_image
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image_to_ground import locate_lines
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes
@@ -87,12 +89,21 @@ def test_what_a_state_cannot_contain_is_told(tmp_path):
     fit = write_csm_state(tmp_path / "jumps.json", jumps, WGS84, max_rows=1000)
     off = differences(jumps, read_scanner(tmp_path / "jumps.json").image)
     assert 1e-6 < fit.trajectory < 1 and off < 2 * fit.ground
+    assert 500 < fit.rows <= 1000
     u = np.linspace(-1, 1, 400)
     wavy = AngleTable(jnp.arctan(0.015 * u + 1e-6 * np.sin(9 * u)), jnp.arctan(0.001 * u**2))
     fit = write_csm_state(
         tmp_path / "lens.json", dataclasses.replace(smooth_image(), optics=wavy), WGS84
     )
     assert 0.1 < fit.optics < 2
+
+
+def test_offsets_are_not_lost_in_writing(tmp_path):
+    """A scanner file has no place for them."""
+    pitch = jnp.array([0.01, 0.0, 0.0])
+    image = eqx.tree_at(lambda image: image.offsets.attitude, above_a_plane(), pitch)
+    with pytest.raises(InputError, match="A: the trajectory has offsets"):
+        write_scanner_image(tmp_path, "A", image, None)
 
 
 def test_a_local_frame_has_no_state(tmp_path):

@@ -9,7 +9,7 @@ import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.pushbroom import Height, locate_points, rpc
-from jaxbundle.pushbroom.ancillary import position_table
+from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.rpc.bias import fit_bias
 from jaxbundle.pushbroom.rpc.fitting import RpcTable, fit_rpc
 from jaxbundle.pushbroom.terrain import make_terrain
@@ -43,6 +43,8 @@ def test_masked_rows_are_refused():
     P, V = orbit(t)
     with pytest.raises(InputError, match="row 5: the position is not a finite number"):
         position_table(t, masked(P, 4, 1), V)
+    with pytest.raises(InputError, match="row 5: the attitude is not a finite number"):
+        attitude_table(t, masked(np.zeros((17, 3)), 4, 1), method="linear")
     image = satellite()
     for call in (
         lambda: rpc.project_points(RPC, *places(RPC, 12)[:2], masked(line, 0)),

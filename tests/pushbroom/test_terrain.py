@@ -70,7 +70,9 @@ def test_first_hits_on_needles():
 def test_no_height_no_point():
     z = np.full((ROWS, COLUMNS), 3.0)
     z[:, 20:24] = np.nan
+    z[0, :2] = -np.inf, np.inf
     terrain = make_terrain(z, (0.0, 0.0), (CELL, CELL), earth=None)
+    assert terrain.lowest == terrain.highest == 3
     o = np.array([[215.0, 100.0, -300.0, 150.0], [100.0, 100.0, 100.0, 100.0], [90.0] * 4])
     d = np.array([[0, 0, 0, 1.0], [0, 0, 0, 0.0], [-1, -1, -1, -1.0]])
     s = np.array(distance(terrain, o, d))

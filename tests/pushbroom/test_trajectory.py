@@ -235,6 +235,8 @@ def broken(array, row, value):
      ["line 9", "1.41421", "w, x, y, z"]),
     (lambda: attitude_table(TIMES, broken(QUATERNIONS, 7, np.nan), source=SOURCE), ["line 9"]),
     (lambda: attitude_table(TIMES, VALUES, source=SOURCE), ["slerp", "linear"]),
+    (lambda: attitude_table(TIMES, VALUES[:, :2], method="linear", source=SOURCE),
+     ["att.csv", "(12, 2)", "pitch, roll, yaw"]),
 ])  # fmt: skip
 def test_bad_tables_are_refused_with_their_row(make, words):
     with pytest.raises(InputError) as refused:

@@ -253,7 +253,9 @@ def _resample_tables(
         rows = np.linspace(union_times[0], union_times[-1], len(union_times))
         R = slerp(union_times, rotations, rows)
     else:
-        rows = np.linspace(pointing_times[0], pointing_times[-1], max(2, len(pointing_times)))
+        rows = np.linspace(pointing_times[0], pointing_times[-1], len(pointing_times))
+        if len(rows) == 1:
+            rows = rows + [0.0, 1.0]
         R = body(rows) * pointing(rows).inv()
     limit_of = partial(extrapolation_limit, settings=settings)
     limits = limit_of(position_times), limit_of(pointing_times)
@@ -293,7 +295,9 @@ def _positions(
             )
         if uses_velocities:
             return CubicHermiteSpline(t, P, V), warnings
-    table = position_table(t, P, method="usgscsm", order=3, gap=np.inf)
+    # As for rotations, how far beyond the ends is for the caller to check.
+    step = float(np.diff(t).max())
+    table = position_table(t, P, method="usgscsm", order=3, gap=np.inf, extrapolate=step)
     return lambda times: np.array(jax.vmap(lambda time: interpolate(table, time))(times)), warnings
 
 

@@ -96,7 +96,7 @@ def write_csm_state(
     # 16 intervals of a second: usual tables have 1 to 100 rows a second
     intervals = int(max(16, np.ceil(16 * (last_time - first_time))))
     best, halvings_without_gain = None, 0
-    while best is None or 2 * intervals <= max_rows:
+    while best is None or intervals + 2 * SIDE_ROWS + 1 <= max_rows:
         t, P, R = _tables(source, first_time, last_time, intervals)
         middles = first_time + (last_time - first_time) * (np.arange(intervals) + 0.5) / intervals
         true_poses = _poses(source, middles)
@@ -319,6 +319,8 @@ def _optics(sights: Float[np.ndarray, "2 pixels"]) -> tuple[dict[str, Any], floa
         "m_startingDetectorSample": 0.0,
     }
     straight_error = max(np.abs(x - distorted).max(), np.abs(y - row).max())
+    # In pixels: above the rounding of a line of 1e5 of them, some 1e-11, and a nanometre on the
+    # ground for pixels of a metre.
     if straight_error < 1e-9:
         fields = {"m_detectorLineOrigin": -row, "m_distortionType": 0}
         return common_fields | fields | {"m_opticalDistCoeffs": [0.0, 0.0, 0.0]}, straight_error / f

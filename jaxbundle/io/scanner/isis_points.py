@@ -336,6 +336,7 @@ def _covariance(path: Path, fields: Fields, id: _Entry) -> Float[np.ndarray, "3 
     C[np.triu_indices(3)] = [number_in(word, where) for word in words]
     C = C + np.triu(C, 1).T
     smallest_eigenvalue = np.linalg.eigvalsh(C)[0]
+    # Numbers written with nine digits leave this much of an eigenvalue that is 0.
     if smallest_eigenvalue < -1e-9 * np.trace(C):
         raise InputError(f"{where} is no covariance: it has a negative eigenvalue")
     # Below this eigenvalues are rounding: it would hold the point along an axis of chance.

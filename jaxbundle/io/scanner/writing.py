@@ -4,10 +4,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.io.scanner.scanner_file import ANGLES
 from jaxbundle.io.text.csv_tables import write_csv, write_text
@@ -36,11 +38,18 @@ def write_scanner_image(
     prefix: str | None = None,
     angle_unit: str = "rad",
 ) -> Path:
-    """Write an image without offsets as `NAME.toml` with its tables, beside what is in a folder.
+    """Write an image as `NAME.toml` with its tables, beside what is in a folder.
 
     `read_scanner` reads the same image. The names of the tables begin with `prefix`, by default
     `NAME_`; angles are in `angle_unit`.
+
+    **Raises:** `InputError` for an image with offsets, for which the file has no place.
     """
+    if any(np.any(offset) for offset in jax.tree.leaves(image.offsets)):
+        raise InputError(
+            f"{name}: the trajectory has offsets, which a scanner file does not contain; apply "
+            "them to its tables, or set them to 0"
+        )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     position, attitude = image.trajectory.position, image.trajectory.attitude

@@ -40,8 +40,8 @@ CONTROL = Source("control points")
 
 
 class RpcBias(eqx.Module):
-    """a₀, a₁, … and b₀, b₁, …, in pixels: as many of each as the degree of the bias needs, 1, 3 or
-    6; terms that are left out are 0."""
+    """a₀, a₁, … and b₀, b₁, …, in pixels: 1, 3 or 6 of each for the degrees 0, 1, 2; those of a
+    higher degree than was estimated are 0."""
 
     line: Float[AnyArray, " terms"] | tuple[Scalar, ...]
     sample: Float[AnyArray, " terms"] | tuple[Scalar, ...]
