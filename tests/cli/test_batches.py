@@ -12,7 +12,7 @@ from batch_cameras import images_of, write_cameras
 from pyarrow.parquet import read_table
 
 from jaxbundle.batches import work
-from jaxbundle.batches.run_on_files import key_of, run_batch
+from jaxbundle.batches.run_on_files import _difference, key_of, run_batch
 from jaxbundle.errors import InputError
 from jaxbundle.io.writing.fingerprints import of_input
 from jaxbundle.system.paths import relative_path
@@ -127,6 +127,14 @@ def test_snooping_is_a_setting_of_its_lines(start, images):
         again()
 
 
+@pytest.mark.parametrize("given, said", [
+    ({"correlated": True}, "correlated was True, is None"), ({}, ""),
+])  # fmt: skip
+def test_correlated_errors_are_a_setting_of_their_lines(given, said):
+    without = work.Work(("a",), {}, lambda _: "data", lambda *_: [])
+    assert _difference({"settings": given, "data": "data"}, without, 0) == said
+
+
 def test_the_limit_of_iterations_matters_where_it_was_reached(start):
     _, file, again = start
     assert again(max_iterations=50) == {"converged": 4, "skipped": 4}
@@ -178,6 +186,37 @@ def test_a_rewritten_network_is_seen(tmp_path, monkeypatch):
         with pytest.raises(InputError, match="block/project.toml: its files were others"):
             run_batch([project, project.parent], file)
         assert run_batch([project, project.parent], file, renew=True) == {"converged": 2}
+
+
+@pytest.mark.parametrize(
+    ("input", "part"),
+    [
+        ("opensfm", "opensfm/reconstruction.json"),
+        ("Ori-All", "Ori-All/Orientation-1.jpg.xml"),
+        ("mrcal", "mrcal/a.cameramodel"),
+        ("realityscan", "realityscan/1.xmp"),
+        ("mav0", "mav0/cam1/sensor.yaml"),
+        ("opensfm/reconstruction.json", "opensfm/tracks.csv"),
+        ("a.phc", "a.eor"),
+        ("a [1].psx", "a [1].files/0/chunk.zip"),
+        ("a.opf", "tracks 1.bin"),
+        ("vins.yaml", "cam0.yaml"),
+        ("bundle.out", "list.txt"),
+    ],
+)
+def test_the_fingerprint_of_a_network_is_of_all_it_is_read_from(input, part, tmp_path):
+    texts = {
+        "a.opf": '{"items": [{"resources": [{"uri": "points.gltf"}]}]}',
+        "points.gltf": '{"buffers": [{"uri": "tracks%201.bin"}]}',
+        "vins.yaml": "cam0_calib: cam0.yaml\n",
+    }
+    for name in (input, part, *texts):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        if not (tmp_path / name).exists() and Path(name).suffix:
+            (tmp_path / name).write_text(texts.get(name, "1"))
+    first = of_input(tmp_path / input)
+    (tmp_path / part).write_text("2")
+    assert of_input(tmp_path / input) != first
 
 
 def test_the_fingerprint_of_a_network_is_of_its_files(tmp_path):

@@ -4,18 +4,49 @@ import hashlib
 import os
 from collections.abc import Iterable, Iterator
 from functools import partial
+from glob import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.slam_yaml import read_yaml_fields
 from jaxbundle.io.networks.project import project_file
-from jaxbundle.io.text.csv_tables import read_toml
+from jaxbundle.io.text.csv_tables import read_text, read_toml
+from jaxbundle.io.text.json_fields import read_object
 from jaxbundle.system.file_content import is_plain
 
-# Files of a folder that hold a network (COLMAP, BINGO); photographs do not count.
-NETWORK_SUFFIXES = {".bin", ".csv", ".dat", ".toml", ".txt"}
+# Files of a folder that hold a network (COLMAP, BINGO, OpenSfM, MicMac, mrcal, RealityScan,
+# camera_info); photographs do not count.
+NETWORK_SUFFIXES = {
+    ".bin",
+    ".cameramodel",
+    ".csv",
+    ".dat",
+    ".json",
+    ".toml",
+    ".txt",
+    ".xml",
+    ".xmp",
+    ".yaml",
+    ".yml",
+}
+# Those of its folders (EuRoC).
+IN_FOLDERS = "cam*/sensor.yaml"
+# Files that are read with a file of a name or a suffix and not named in it; {stem}: its name.
+COMPANIONS = {
+    "reconstruction.json": ("tracks.csv", "ground_control_points.json", "reference_lla.json"),
+    ".out": ("list.txt",),
+    ".phc": ("{stem}.ior", "{stem}.eor", "{stem}.obc", "{stem}.scale"),
+    ".psx": (
+        "{stem}.files/project.zip",
+        "{stem}.files/*/chunk.zip",
+        "{stem}.files/*/*/frame.zip",
+        "{stem}.files/*/*/point_cloud/point_cloud.zip",
+    ),
+}
 
 _hash = partial(hashlib.blake2b, digest_size=8)
 
@@ -78,16 +109,35 @@ def _named_files(path: Path) -> Iterator[Path]:
         yield from sorted(
             file for file in path.iterdir() if file.suffix.lower() in NETWORK_SUFFIXES
         )
+        yield from sorted(path.glob(IN_FOLDERS))
         return
     yield path
-    if path.suffix.lower() == ".toml":
-        try:
-            document = read_toml(path)
-        except InputError:
-            return
-        for text in _texts(document):
-            if os.path.isfile(path.parent / text):
-                yield path.parent / text
+    name, suffix = path.name.lower(), path.suffix.lower()
+    for pattern in COMPANIONS.get(name, COMPANIONS.get(suffix, ())):
+        yield from sorted(path.parent.glob(pattern.format(stem=escape(path.stem))))
+    try:
+        document = _document(path)
+    except InputError:
+        return
+    for text in _texts(document):
+        # Those of an OPF are addresses, in which a blank is %20.
+        for name in dict.fromkeys((text, unquote(text))):
+            file = path.parent / name
+            if os.path.isfile(file):
+                # The points of an OPF name the files of their numbers.
+                yield from _named_files(file) if file.suffix.lower() == ".gltf" else (file,)
+
+
+def _document(path: Path) -> Any:
+    """The content of a file that may name others; None of any other."""
+    match path.suffix.lower():
+        case ".toml":
+            return read_toml(path)
+        case ".yaml" | ".yml":
+            return read_yaml_fields(path).document
+        case ".opf" | ".gltf":
+            return read_object(path, read_text(path), "JSON")
+    return None
 
 
 def _texts(value: Any) -> Iterator[str]:
