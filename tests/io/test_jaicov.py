@@ -70,6 +70,23 @@ def test_a_project(tmp_path):
     assert any("1 image point" in told and "'999'" in told for told in net.warnings)
 
 
+def test_images_that_are_not_active_do_not_come_back_by_their_points(tmp_path):
+    rows = files()[".eor"].splitlines(keepends=True)
+    off = rows[0] + rows[1].replace(" 0 1 3\n", " 0 0 3\n") + rows[2]
+    net = read_network(write(tmp_path, eor=off))
+    assert net.images.id == ("1", "3") and len(net.observations) == 2 * len(POINTS)
+    assert any("not active in .eor: '2'" in told for told in net.warnings)
+
+
+def test_a_camera_that_is_guessed_is_told(tmp_path):
+    """An image that is only in .phc has no camera; with one camera it is that."""
+    eor = "".join(files()[".eor"].splitlines(keepends=True)[:2])
+    told = lambda **changed: " ".join(read_network(write(tmp_path, eor=eor, **changed)).warnings)
+    assert "not in .eor" not in told()
+    ior = files()[".ior"]
+    assert "1 image not in .eor" in told(ior=ior + "2" + ior[1:])
+
+
 def test_there_and_back(tmp_path):
     net = read_network(write(tmp_path))
     assert write_jaicov(net, tmp_path / "new.phc") == ()

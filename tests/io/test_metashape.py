@@ -295,7 +295,9 @@ def test_references_that_are_no_control(tmp_path):
     for text in (with_markers(geographic), with_markers(enabled=few)):
         net = read(tmp_path, text)
         assert net.datum == "inner" and set(net.points.role) == {"tie"}
-        assert ("not in a local system" in " ".join(net.warnings)) == ("GEOGCS" in text)
+        told = " ".join(net.warnings)
+        assert ("not in a local system" in told) == ("GEOGCS" in text)
+        assert ("a datum needs three enabled markers" in told) == ("GEOGCS" not in text)
 
 
 BROKEN = {

@@ -119,6 +119,17 @@ def test_a_reconstruction(tmp_path):
     assert result.converged and result.sigma0 < 1e-6
 
 
+def test_positions_that_are_too_few_for_a_datum_are_told(tmp_path):
+    reconstructions, tracks = files(gps=True)
+    document = json.loads(json.dumps(reconstructions))
+    shots = max((r["shots"] for r in document), key=len)
+    del next(iter(shots.values()))["gps_position"]
+    write(tmp_path, document, tracks)
+    net = read_network(tmp_path)
+    assert not net.further and net.datum == "inner"
+    assert any("gps_position of 2 shots is not read" in told for told in net.warnings)
+
+
 def test_there_and_back(tmp_path):
     net = network("opencv", ("a.jpg", "b.jpg", "c.jpg"))
     made = convert_to(net, tmp_path / "opensfm")

@@ -132,11 +132,14 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
         id = row.text("intrinsicId")
         cameras[id] = _camera(row, id, version)
     poses = {row.text("poseId"): row.child("pose.transform") for row in file.rows("poses")}
-    views = {}
+    views, without_camera = {}, []
     for row in file.rows("views"):
         unknown.check(row.document, VIEW_KEYS, row.path)
+        id = row.text("viewId")
         if row.text("intrinsicId", "none") in cameras:
-            views[row.text("viewId")] = row
+            views[id] = row
+        else:
+            without_camera.append(Path(_photograph_path(row, id)).name)
     tie_points, colours, rays = _structure(file, unknown, views)
     measured_views = {view for view, *_ in rays}
     posed_views = {id for id, row in views.items() if row.text("poseId", "none") in poses}
@@ -176,9 +179,14 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
     rgb = stack_rows([_parse_numbers(value) for value in colours], 3, location_of).reshape(-1, 3)
     location_of = lambda k: (f"{path}, landmark {rays[k][1]}, view {rays[k][0]}", "x")
     xy = stack_rows([_parse_numbers(x) for *_, x in rays], 2, location_of).reshape(-1, 2)
+    left_out = {
+        "without pose and image points": omitted_views,
+        "whose intrinsicId is not among the intrinsics, with their image points": without_camera,
+    }
     messages = [
-        f"left out {count(len(omitted_views), 'view')} without pose and image points: "
-        f"{list_some(omitted_views)}"
+        f"left out {count(len(names_left_out), 'view')} {why}: {list_some(names_left_out)}"
+        for why, names_left_out in left_out.items()
+        if names_left_out
     ]
     return assemble(
         path,
@@ -197,7 +205,7 @@ def read_alicevision(path: str | Path, overrides: Sequence[str] = ()) -> Network
             },
             Source(str(path), None, "observation"),
         ),
-        (*(messages if omitted_views else ()), *unknown.messages()),
+        (*messages, *unknown.messages()),
     )
 
 

@@ -19,7 +19,7 @@ Source: Loesler, JAiCov (Java Aicon Covariance), the columns its readers name; L
 Nahbereichsphotogrammetrie, eq. 2.31, for the rotation.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -58,11 +58,20 @@ def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     path = Path(path)
     companions = {suffix: path.with_suffix(suffix) for suffix in COMPANION_SUFFIXES}
     cameras = _cameras(companions[".ior"])
-    images, angles, position, camera, messages = _images(companions[".eor"])
+    images, angles, position, camera, inactive, messages = _images(companions[".eor"])
     points, coordinates, datum = _points(companions[".obc"])
-    rays, lines, ray_messages = _rays(path, points if companions[".obc"].is_file() else None)
+    rays, lines, ray_messages = _rays(
+        path, inactive, points if companions[".obc"].is_file() else None
+    )
     for image in rays["image"]:
         images.setdefault(image, len(images))
+    without_camera = list(images)[len(camera) :]
+    if without_camera and len(cameras) > 1:
+        ray_messages.append(
+            f"{count(len(without_camera), 'image')} not in .eor, which names the camera of an "
+            f"image: {list_some(without_camera)}; the first of {len(cameras)} cameras is taken: "
+            "give their rows"
+        )
     for point in rays["point"]:
         points.setdefault(point, len(points))
     # Images and points that only the image points name follow those of .eor and .obc, as unknown.
@@ -130,15 +139,21 @@ def _cameras(file: Path) -> dict[str, dict]:
 def _images(
     file: Path,
 ) -> tuple[
-    dict[str, int], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], list[str], list[str]
+    dict[str, int],
+    Float[np.ndarray, "n 3"],
+    Float[np.ndarray, "n 3"],
+    list[str],
+    set[str],
+    list[str],
 ]:
-    """Row of each image, angles, positions, cameras, and messages."""
+    """Row of each image, angles, positions, cameras, the images that are not active, messages."""
     images: dict[str, int] = {}
-    angles, position, camera, unread_ids = [], [], [], []
+    angles, position, camera, inactive, unread_ids = [], [], [], [], []
     for row in TextRows(file, comment="#") if file.is_file() else ():
         names = ("X0", "Y0", "Z0", "omega", "phi", "kappa", "order", "active", "state")
         entry = dict(zip(names, row.numbers(names, 2, allow_more=True).tolist()))
         if entry["active"] == 0:
+            inactive.append(row.words[0])
             continue
         _number_row(row, images, "image")
         # Order 0: ω, φ, κ; state 1: not oriented, 2: approximately, 3: by bundle adjustment.
@@ -157,7 +172,9 @@ def _images(
         if unread_ids
         else []
     )
-    return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, messages)
+    as_rows = lambda numbers: np.reshape(numbers, (-1, 3))
+    off = {*inactive}.difference(images)
+    return images, as_rows(angles), as_rows(position), camera, off, messages
 
 
 def _points(file: Path) -> tuple[dict[str, int], Float[np.ndarray, "n 3"], list[str]]:
@@ -183,16 +200,19 @@ def _number_row(row: TextRow, table: dict[str, int], kind: str) -> None:
 
 
 def _rays(
-    file: Path, points: Mapping[str, int] | None
+    file: Path, inactive: Container[str], points: Mapping[str, int] | None
 ) -> tuple[dict[str, list], list[int], list[str]]:
-    """The columns of image points, their lines, and messages."""
+    """The columns of image points, but those of `inactive` images, their lines, and messages."""
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y", "sx", "sy")}
-    lines, unknown = [], []
+    lines, unknown, of_inactive = [], [], []
     names = ("x", "y", "sx", "sy", "vx", "vy", "method", "active")
     for row in TextRows(file, comment="#"):
         values = row.numbers(names, 2, allow_more=True)
         image, point = row.words[:2]
         if values[-1] <= 0:
+            continue
+        if image in inactive:
+            of_inactive.append(image)
             continue
         if points is not None and point not in points:
             unknown.append(point)
@@ -202,11 +222,16 @@ def _rays(
         lines.append(row.number)
     if not lines:
         raise InputError(f"{file}: there are no active image points")
-    template = "left out {} of points that are not in .obc, or not active there: {}"
+    left_out = {
+        "points that are not in .obc, or not active there": unknown,
+        "images that are not active in .eor": of_inactive,
+    }
     messages = [
-        template.format(count(len(unknown), "image point"), list_some(dict.fromkeys(unknown)))
+        f"left out {count(len(ids), 'image point')} of {why}: {list_some(dict.fromkeys(ids))}"
+        for why, ids in left_out.items()
+        if ids
     ]
-    return columns, lines, messages if unknown else []
+    return columns, lines, messages
 
 
 def _with_distances(network: Network, file: Path) -> Network:

@@ -405,6 +405,11 @@ def _describe_references(chunk: ET.Element, control: Points | None) -> Iterator[
             "the cameras are in geocentric coordinates: --control FILE gives control in a "
             "rectangular frame"
         )
+    elif any(m.get("x") is not None for m in chunk.iterfind("markers//marker/reference")):
+        yield (
+            "the reference coordinates of markers are not read: a datum needs three enabled "
+            "markers that have them and are measured in images"
+        )
 
 
 def _is_local(chunk: ET.Element) -> bool:

@@ -203,6 +203,11 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             f"{reason}; left out {count(len(omitted_shots), 'shot')}: {list_some(omitted_shots)}"
         )
     gps = _observed_centres(shots)
+    if not gps and (number := sum(shot.get("gps_position") is not None for shot in shots.values())):
+        messages.append(
+            f"gps_position of {count(number, 'shot')} is not read: fewer than three do not "
+            "determine a datum"
+        )
     points = scene.objects("points")
     for point in points.values():
         unknown.check(point.document, POINT_KEYS, point.path)
