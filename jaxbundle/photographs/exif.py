@@ -184,8 +184,8 @@ def _time(value: Any, fraction: Any) -> datetime.datetime | None:
 def _geographic_position(gps: Mapping[int, Any], xmp: Xmp) -> GeographicPosition | None:
     from PIL.ExifTags import GPS
 
-    latitude = _angle(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef))
-    longitude = _angle(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef))
+    latitude = _angle(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), 90)
+    longitude = _angle(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), 180)
     # 0° N 0° E is what receivers write before their first position
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         return None
@@ -200,13 +200,14 @@ def _geographic_position(gps: Mapping[int, Any], xmp: Xmp) -> GeographicPosition
     )
 
 
-def _angle(parts: Any, reference: Any) -> float | None:
-    """Degrees, minutes, seconds as degrees; negative to the south and west."""
+def _angle(parts: Any, reference: Any, largest: float) -> float | None:
+    """Degrees, minutes, seconds as degrees; negative to the south and west; None if unreadable or
+    larger than a latitude or longitude can be."""
     try:
         degrees, minutes, seconds = (float(part) for part in parts)
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     angle = degrees + minutes / 60 + seconds / 3600
-    if not math.isfinite(angle) or abs(angle) > 180:
+    if not math.isfinite(angle) or abs(angle) > largest:
         return None
     return -angle if _text(reference)[:1].upper() in ("S", "W") else angle

@@ -60,7 +60,7 @@ def map_positions(
     rows, known_places = [k for k, _ in located], [place for _, place in located]
     latitude = np.array([p.latitude for p in known_places])
     longitude = np.array([p.longitude for p in known_places])
-    system = system or utm_system(float(np.median(latitude)), float(np.median(longitude)))
+    system = system or _utm_system_of_most(latitude, longitude)
     axis = _need_pyproj().CRS.from_user_input(system).axis_info[0]
     if axis.unit_conversion_factor != 1:
         return None
@@ -125,9 +125,18 @@ def to_map(
             f"{where}: {longitude:g}, {latitude:g} is no place in {system}: expected longitude, "
             "then latitude, in degrees"
         )
-    target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
+    target = _utm_system_of_most(X[:, 1], X[:, 0])
     x, y = _transformer(crs, target, where).transform(X[:, 0], X[:, 1])
     return np.stack([x, y, X[:, 2]], 1), target
+
+
+def _utm_system_of_most(
+    latitude: Float[np.ndarray, " n"], longitude: Float[np.ndarray, " n"]
+) -> str:
+    """The system of the median place."""
+    # Across the meridian of 180° longitudes jump by 360°, their differences do not.
+    east_of_first = (longitude - longitude[0] + 180) % 360 - 180
+    return utm_system(float(np.median(latitude)), float(longitude[0] + np.median(east_of_first)))
 
 
 def _is_in_area(xy: Float[np.ndarray, "n 2"], crs: Any) -> bool:

@@ -8,6 +8,11 @@ WIDTHS = {
     "canon eos 5d": 36.0,
     "canon eos 6d": 36.0,
     "canon eos r": 36.0,
+    "canon eos r7": 22.3,
+    "canon eos r10": 22.3,
+    "canon eos r50": 22.3,
+    "canon eos r100": 22.3,
+    "canon eos rebel": 22.3,
     "canon eos d60": 22.7,
     "canon eos 10d": 22.7,
     "canon eos 20d": 22.5,
@@ -84,6 +89,8 @@ WIDTHS = {
     "dji fc7203": 6.3, "dji zenmusep1": 35.9, "dji m3e": 17.3, "dji l1d-20c": 13.2,
     "parrot bebop": 6.17, "parrot anafi": 5.9, "sensefly s.o.d.a.": 12.75,
     "gopro hero3": 6.17, "gopro hero4": 6.17, "ricoh gr": 23.6, "pentax k-5": 23.7,
+    "ricoh gr digital": 7.18, "ricoh gr digital 2": 7.31, "ricoh gr digital 3": 7.44,
+    "ricoh gr digital 4": 7.44,
 }  # fmt: skip
 
 

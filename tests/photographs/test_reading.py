@@ -83,6 +83,9 @@ def test_exif(tmp_path):
     f = pytest.approx(24 / 35.9 * 90)
     assert found.principal_distance()[::2] == (f, "focal length and sensor")
     assert found.place == GeographicPosition(pytest.approx(-33.51), pytest.approx(-70.75), 512.5)
+    gps[2] = (91.0, 0.0, 0.0)  # no latitude
+    Image.fromarray(GREY).save(tmp_path / "a.jpg", exif=head)
+    assert read_exif(tmp_path / "a.jpg").place is None
 
 
 def test_resolution_in_the_focal_plane_is_that_of_the_photograph_as_it_was_taken(tmp_path):
@@ -115,6 +118,31 @@ def test_sensors_are_not_mistaken():
     assert sensor_width("Canon", "Canon EOS 5D Mark II") == 36.0
     assert sensor_width("DJI", "FC6310") == 13.2
     assert sensor_width("NIKON", "NIKON D8000") is None
+
+
+@pytest.mark.parametrize("model, width", [
+    ("Canon EOS R", 36.0), ("Canon EOS RP", 36.0), ("Canon EOS R6m2", 36.0),
+    ("Canon EOS R6 Mark II", 36.0), ("Canon EOS R1", 36.0), ("Canon EOS R7", 22.3),
+    ("Canon EOS R10", 22.3), ("Canon EOS R50", 22.3), ("Canon EOS R100", 22.3),
+    ("Canon EOS REBEL T3i", 22.3), ("Canon EOS REBEL SL1", 22.3), ("RICOH GR III", 23.6),
+    ("RICOH GR DIGITAL 4", 7.44),
+])  # fmt: skip
+def test_cameras_of_one_first_name_have_sensors_of_their_own(model, width):
+    assert sensor_width(model.split()[0], model) == width
+
+
+@pytest.mark.parametrize("west", [2, 3])
+def test_the_zone_of_places_on_both_sides_of_180_degrees(west):
+    """Fiji: zone 60 ends at 180° E, zone 1 begins there; most photographs decide."""
+    longitudes = [179.99 + 0.001 * k for k in range(west)]
+    longitudes += [-179.99 - 0.001 * k for k in range(5 - west)]
+    system = "EPSG:32760" if west > 2 else "EPSG:32701"
+    X, *_, found, _ = map_positions([GeographicPosition(-17.0, x, 9.0) for x in longitudes])
+    assert found == system and np.ptp(X[:, 0]) < 3000 and (X[:, 1] > 8e6).all()
+    places = np.array([[x, -17.0, 9.0] for x in longitudes])
+    moved, found = to_map(places, "EPSG:4326", "gcp")
+    assert found == system
+    np.testing.assert_allclose(moved, X, atol=1e-3)
 
 
 def test_positions_in_a_map():
