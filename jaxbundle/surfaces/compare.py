@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from jaxbundle.arguments import integer
 from jaxbundle.errors import InputError
 from jaxbundle.surfaces.cloud import Cloud
 from jaxbundle.surfaces.scatter import robust_sigma
@@ -26,11 +27,12 @@ def compare(
     neighbour, in median spacings of the second cloud; larger, and the plane is continued beyond the
     edge of the cloud and over its gaps.
 
-    **Raises:** `InputError` if either has fewer than four points."""
+    **Raises:** `InputError` if either has fewer than four points, or `neighbours` are fewer than
+    three."""
     if min(len(cloud), len(other)) < 4:
         raise InputError("a comparison needs clouds of at least four points")
     tree = cKDTree(other.X)
-    k = min(neighbours, len(other))
+    k = min(integer("neighbours", neighbours, least=3), len(other))
     # The median of 20 000 distances is within 1 % of that of all.
     spacing = float(np.median(tree.query(other.X[:: max(1, len(other) // 20_000)], 2)[0][:, 1]))
     distance, sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
@@ -45,7 +47,8 @@ def compare(
     v = distance[np.isfinite(distance)]
     if not len(v):
         raise InputError("the clouds have nothing in common: check their coordinate systems")
-    ratio = (distance / sigma)[np.isfinite(distance) & np.isfinite(sigma) & (sigma > 0)]
+    is_known = np.isfinite(distance) & np.isfinite(sigma) & (sigma > 0)
+    ratio = distance[is_known] / sigma[is_known]
     return {
         "points": len(v),
         "without_neighbours": int(len(cloud) - len(v)),

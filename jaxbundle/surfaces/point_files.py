@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from jaxtyping import Real, UInt8
 
 from jaxbundle.choices import CLOUD_FILES
 from jaxbundle.errors import InputError
@@ -121,9 +122,23 @@ def _read_ply(path: Path) -> Cloud:
         X = np.stack([columns[axis].astype(float) for axis in "xyz"], 1)
         colour = None
         if {*COLOURS} <= {*names}:
-            colour = np.stack([columns[c] for c in COLOURS], 1).astype(np.uint8)
+            are_real = all(dict(fields)[c] in ("<f4", "<f8") for c in COLOURS)
+            colour = np.nan_to_num(np.stack([columns[c] for c in COLOURS], 1))
+            colour = _bytes_of_colours(colour, are_real)
     cloud = make_cloud(Source(str(path), None, "point"), X, columns, colour)
     return _add_base_images(cloud, lines, columns)
+
+
+def _bytes_of_colours(
+    colour: Real[np.ndarray, "n 3"], are_real: bool = False
+) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of 0–255 from those of 0–255, of 16 bits, or, where they `are_real`, of 0–1."""
+    largest = colour.max(initial=0)
+    if are_real and largest <= 1:
+        colour = np.rint(255 * colour)
+    elif largest > 255:  # 255 is 65535 in 16 bits
+        colour = colour // 257
+    return colour.astype(np.uint8)
 
 
 def _add_base_images(
@@ -239,7 +254,7 @@ def _read_las(path: Path, points_at_once: int = 1 << 18) -> Cloud:
         header, begin = reader.header, 0
         names = {*header.point_format.dimension_names}
         X = np.empty((header.point_count, 3))
-        colour = np.empty(X.shape, np.uint8) if {*COLOURS} <= names else None
+        colour = np.empty(X.shape, np.uint16) if {*COLOURS} <= names else None
         extra_columns = {name: [] for name in (*SIGMAS, "rays") if name in names}
         for points in reader.chunk_iterator(points_at_once):
             part = slice(begin, begin := begin + len(points))
@@ -249,7 +264,7 @@ def _read_las(path: Path, points_at_once: int = 1 << 18) -> Cloud:
                 X[part, k] += header.offsets[k]
             if colour is not None:
                 for k, name in enumerate(COLOURS):
-                    np.floor_divide(points[name], 257, out=colour[part, k], casting="unsafe")
+                    colour[part, k] = points[name]
             for name, columns in extra_columns.items():
                 columns.append(np.array(points[name]))
         if begin < len(X):
@@ -262,6 +277,8 @@ def _read_las(path: Path, points_at_once: int = 1 << 18) -> Cloud:
         name: np.concatenate(parts) if parts else np.zeros(0)
         for name, parts in extra_columns.items()
     }
+    if colour is not None:
+        colour = _bytes_of_colours(colour)
     return make_cloud(Source(str(path), None, "point"), X, columns, colour, system)
 
 

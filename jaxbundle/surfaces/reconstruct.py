@@ -181,7 +181,7 @@ def reconstruct_surface(
     # Pixels between the points of a dense cloud, so that those of all base images fit into memory.
     pixels = sum(views[i].size[0] * views[i].size[1] for i in partners)
     every_nth = step or max(1, int(np.ceil(np.sqrt(pixels / settings.dense.max_points))))
-    thinned = f"every {every_nth}th pixel in both directions, to limit memory; --step 1 takes all"
+    thinned = f"one of {every_nth} pixels in both directions, to limit memory; --step 1 takes all"
     messages = [thinned] if dense and not step and every_nth > 1 else []
     clouds, counts_of_images = [], []
     for done, (i, others) in enumerate(partners.items()):

@@ -244,7 +244,7 @@ def is_ground_image(path: Path) -> bool:
         return True
     if path.suffix.lower() in (".json", ".dim", ".imd"):
         return True
-    return path.suffix == ".toml" and path.is_file() and b"[scanner]" in path.read_bytes()
+    return path.suffix.lower() == ".toml" and path.is_file() and b"[scanner]" in path.read_bytes()
 
 
 def read_grey(path: Path, pixels_at_once: int = 1 << 23) -> Grey:
@@ -360,7 +360,7 @@ def _orientation(
         raise no_such_file(path, "a raster with RPC, or a scanner file")
     if path.suffix.lower() in IMAGES:
         return read_rpc(find_coefficients(path)), path
-    scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (path.suffix == ".toml")
+    scanner = path.suffix.lower() in (".json", ".dim", ".imd", ".toml")
     if path.suffix.lower() == ".xml":
         try:
             return read_rpc(path), raster or _raster_of(path, folder)

@@ -3,6 +3,7 @@
 import dataclasses
 
 import ezdxf
+import laspy
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from jaxbundle.surfaces.compare import compare
 from jaxbundle.surfaces.dsm import NO_DATA, Dsm, make_dsm, write_dsm
 from jaxbundle.surfaces.files import text_of
 from jaxbundle.surfaces.orthophoto import orthophoto, write_orthophoto
-from jaxbundle.surfaces.point_files import _read_las, read_cloud, write_cloud
+from jaxbundle.surfaces.point_files import COLOURS, _read_las, read_cloud, write_cloud
 
 
 def cloud_on_plane(n=4000, noise=0.05, seed=0, system=None):
@@ -124,6 +125,34 @@ def test_files_read_back_equal(plane, tmp_path, kind):
         np.testing.assert_array_equal(back.colour, plane.colour)
     if kind in ("las", "laz"):
         assert back.system == "EPSG:32633"
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("kind, numbers, colour", [
+    ("uchar", [0, 32, 255], [0, 32, 255]), ("ushort", [0, 256, 65535], [0, 0, 255]),
+    ("ushort", [0, 32, 255], [0, 32, 255]), ("float", [0.0, 0.2, 1.0], [0, 51, 255]),
+    ("float", [0.0, 51.0, 255.0], [0, 51, 255]),
+])  # fmt: skip
+def test_colours_of_any_type_in_ply(tmp_path, form, kind, numbers, colour):
+    path = tmp_path / "cloud.ply"
+    names = [*(f"float {axis}" for axis in "xyz"), *(f"{kind} {c}" for c in COLOURS)]
+    head = ["ply", f"format {form} 1.0", "element vertex 1", *(f"property {n}" for n in names)]
+    types = [("", "<f4", 3), ("c", {"uchar": "u1", "ushort": "<u2", "float": "<f4"}[kind], 3)]
+    row = np.array([((1, 2, 3), tuple(numbers))], types)
+    body = row.tobytes() if form != "ascii" else f"1 2 3 {' '.join(map(str, numbers))}\n".encode()
+    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + body)
+    assert read_cloud(path).colour.tolist() == [colour]
+
+
+def test_colours_of_eight_bits_in_las(plane, tmp_path):
+    """Against the standard, which has 16 bits, but frequent."""
+    path = tmp_path / "cloud.las"
+    write_cloud(plane, path)
+    las = laspy.read(path)
+    for k, name in enumerate(COLOURS):
+        las[name] = plane.colour[:, k]
+    las.write(path)
+    np.testing.assert_array_equal(read_cloud(path).colour, plane.colour)
 
 
 def test_any_name_of_an_image_comes_back_from_ply(plane, tmp_path):
@@ -297,6 +326,8 @@ def test_clouds_are_compared_along_normals(plane):
     found = compare(raised, other)
     assert found["median"] == pytest.approx(0.5 / np.sqrt(1.05), abs=0.02)
     assert compare(plane, other)["normalised_rms"] < 1.2
+    with pytest.raises(InputError, match="neighbours must be a whole number from 3"):
+        compare(plane, other, neighbours=2)
     with pytest.raises(InputError, match="nothing in common"):
         compare(Cloud(plane.X + 1e4, *(getattr(plane, n) for n in
                 ("covariance", "rays", "image", "uv", "images"))), other)  # fmt: skip

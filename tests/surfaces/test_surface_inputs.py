@@ -83,18 +83,20 @@ def test_a_point_without_its_worst_ray_keeps_the_weights_of_the_others():
         np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-9)
 
 
-def test_one_input_is_an_image_by_its_name_or_a_project():
+def test_one_input_is_an_image_by_its_name_or_a_project(tmp_path):
     """Of an image alone, `surface` says that it needs another; a folder holds photographs."""
     for name in ("a.tif", "a.TIF", "a_RPC.TXT", "a.RPB", "a.json"):
         assert scanner_inputs.is_ground_image(Path(name)), name
     for name in ("project", "images.csv", "project.toml"):
         assert not scanner_inputs.is_ground_image(Path(name)), name
+    (tmp_path / "A.TOML").write_text("[scanner]\n")
+    assert scanner_inputs.is_ground_image(tmp_path / "A.TOML")
 
 
 @pytest.mark.parametrize("name, kind", [
     ("a.tif", "rpc"), ("a.RPB", "rpc"), ("a_RPC.TXT", "rpc"), ("rpc.xml", "rpc"),
-    ("attitude.XML", "scanner"), ("a.toml", "scanner"), ("a.json", "scanner"),
-    ("a.dim", "scanner"), ("a.IMD", "scanner"),
+    ("attitude.XML", "scanner"), ("a.toml", "scanner"), ("A.TOML", "scanner"),
+    ("a.json", "scanner"), ("a.dim", "scanner"), ("a.IMD", "scanner"),
 ])  # fmt: skip
 def test_a_file_is_read_as_what_its_name_says_or_its_content(tmp_path, monkeypatch, name, kind):
     """XML is of polynomials or of a scanner: the first, if it can be read as such."""
