@@ -35,8 +35,8 @@ def join_views(views: Mapping[str, BoardViews]) -> BoardViews:
 
     **Arguments:** by the name of the board its views, which are named as their photographs.
 
-    **Returns:** views "PHOTOGRAPH:BOARD" in the order of the photographs, `photographs` their
-    photographs; `failures`: the photographs without any board.
+    **Returns:** views "PHOTOGRAPH:BOARD", sorted by the names of the photographs; `photographs`:
+    theirs; `failures`: the photographs without any board.
 
     **Raises:** `InputError` if image sizes differ.
     """
@@ -85,8 +85,10 @@ def measure_board_set(
 
     **Returns:** the views of a `BoardSet` of those boards that were found.
 
-    **Raises:** `InputError` if photographs have different sizes, or none shows a board.
+    **Raises:** `InputError` if photographs have different sizes, none shows a board, or a name of a
+    board has a colon.
     """
+    boards = require_boards(boards)
     file_of = name_photographs(photographs(paths))
     if not file_of:
         raise InputError("no photographs are given")

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.arguments import show
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import affine
@@ -89,9 +90,9 @@ def fit_fiducials(
     """The transformation from measured to calibrated coordinates of fiducial marks.
 
     **Arguments:** the marks in the same order; `kind`: "similarity", "affine" or "projective";
-    `weights` p = 1/σ².
+    `weights` p = 1/σ², 0 for marks that only get residuals.
 
-    **Raises:** `InputError` for too few marks, or marks on a line.
+    **Raises:** `InputError` for too few marks, marks on a line, or negative weights.
     """
     if kind not in UNKNOWNS:
         raise InputError(f"kind of transformation {kind!r}{did_you_mean(kind, UNKNOWNS)}")
@@ -101,17 +102,25 @@ def fit_fiducials(
             f"fiducial marks must come in pairs, [marks, 2] twice, but have the shapes "
             f"{source.shape} and {target.shape}"
         )
-    marks, unknowns = len(source), UNKNOWNS[kind]
-    if 2 * marks < unknowns:
+    p = np.ones(len(source)) if weights is None else np.asarray(weights, float)
+    if p.shape != source.shape[:1] or not (np.isfinite(p) & (p >= 0)).all():
         raise InputError(
-            f"{marks} fiducial marks are too few for the {kind} transformation: give "
+            f"fiducial marks: expected {len(source)} weights, one of 0 or more for each mark, but "
+            f"they are {show(weights)}"
+        )
+    # Marks of weight 0 have residuals, but determine nothing.
+    marks, unknowns = int(np.count_nonzero(p)), UNKNOWNS[kind]
+    if 2 * marks < unknowns:
+        of_weight = " of weight above 0" if marks < len(source) else ""
+        raise InputError(
+            f"{marks} fiducial marks{of_weight} are too few for the {kind} transformation: give "
             f"{unknowns // 2} or more, or choose a simpler one"
         )
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise InputError("fiducial marks: every coordinate must be a finite number")
-    p = np.ones(marks) if weights is None else np.asarray(weights, float)
     # Pixels of thousands beside mm: reduced to the centroid and the spread, N is well scaled.
-    middle, size = source.mean(0), max(float(source.std()), 1e-300)
+    middle = source.mean(0)
+    size = max(float((source - middle).std()), 1e-300)
     fit = _fit(kind, unknowns, (source - middle) / size, target, p)
     if not bool(fit.determined):
         raise InputError(
@@ -125,7 +134,7 @@ def fit_fiducials(
         kind,
         parameters,
         variance * J @ np.asarray(fit.cofactor) @ J.T,
-        np.zeros((marks, 2)),
+        np.zeros_like(source),
         variance**0.5,
         redundancy,
     )

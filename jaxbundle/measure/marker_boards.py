@@ -74,15 +74,14 @@ def _other_dictionary(grey: Grey, board: Board) -> str | None:
     dictionaries = {
         name: get_dictionary(name) for name in sorted(DICTIONARIES) if hasattr(aruco, name)
     }
-    best, largest_number = (
-        None,
-        3,
-    )  # up to three markers may be false readings of another dictionary
+    # Up to three markers may be false readings of another dictionary.
+    best, largest_number = None, 3
+    first, end = board.first_marker, board.first_marker + board.markers
     for name, dictionary in sorted(dictionaries.items(), key=lambda item: len(item[1].bytesList)):
-        if name == board.dictionary or len(dictionary.bytesList) < board.markers:
+        if name == board.dictionary or len(dictionary.bytesList) < end:
             continue
         numbers = _see_markers(grey, dataclasses.replace(board, dictionary=name)).number
-        number = int((numbers < board.markers).sum())
+        number = int(((numbers >= first) & (numbers < end)).sum())
         if number > largest_number:
             best, largest_number = name, number
     return best
@@ -97,7 +96,7 @@ def _of_numbers(markers_seen: SeenMarkers, board: Board) -> Board | None:
             columns: max(
                 _fits(markers_seen, board.kind, markers_seen.number - first_number, columns)
             )
-            for columns in range(SMALLEST_SIDE[board.kind], MAX_COLUMNS)
+            for columns in range(SMALLEST_SIDE[board.kind], MAX_COLUMNS + 1)
         }
         largest_number = max(agreeing for agreeing, _ in fits.values())
         best = [columns for columns, (agreeing, _) in fits.items() if agreeing == largest_number]

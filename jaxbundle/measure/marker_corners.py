@@ -109,7 +109,7 @@ def fit_marker_corners(
         # One lens, one distance: τ of a marker is the median over its sides.
         own_blur = fits.blur.reshape(-1, 4)
         blur_before, blur = blur, np.repeat(np.median(own_blur, axis=1), 4).reshape(own_blur.shape)
-        is_lost = ~_is_near(xy, approximate)
+        is_lost = ~_is_near(xy, approximate, cells.shape[1])
         xy[is_lost] = approximate[is_lost]
     # Where the cells are narrow, or the blur was not the expected one, once more from there: with τ
     # larger by a fifth `clearance` leaves 1.4 % of the contrast of adjacent edges instead of 0.4 %.
@@ -125,7 +125,7 @@ def fit_marker_corners(
         _replace_rows(edges, sides, parts[0])
         _replace_rows(fits, sides, parts[1])
         xy[needs_repeat], covariance[needs_repeat] = parts[2:]
-        is_lost |= ~_is_near(xy, approximate)
+        is_lost |= ~_is_near(xy, approximate, cells.shape[1])
         xy[is_lost] = approximate[is_lost]
     shift = edge_shift(fitting, xy, cells, fits)
     if shift is not None:
@@ -134,7 +134,7 @@ def fit_marker_corners(
         fits.covariance[:, 0, 0] += (shift[1] * fits.blur) ** 2
         xy, covariance = _intersect(edges, _with_model_errors(edges, fits, settings), number)
     why = _find_reasons(edges, fits, covariance, settings)
-    why[~_is_near(xy, approximate) | is_lost] = NO_EDGE
+    why[~_is_near(xy, approximate, cells.shape[1]) | is_lost] = NO_EDGE
     return MarkerCorners(xy, covariance, why)
 
 
@@ -161,11 +161,16 @@ def _find_reasons(
     return why
 
 
-def _is_near(xy: Quadrilaterals, approximate: Quadrilaterals) -> Bool[np.ndarray, "markers 4"]:
-    """Whether corners are where the marker was found: within 2.5 pixels or a seventh of its side,
-    less than a cell."""
+def _is_near(
+    xy: Quadrilaterals, approximate: Quadrilaterals, cells_across: int
+) -> Bool[np.ndarray, "markers 4"]:
+    """Whether corners are where the marker was found: within 2.5 pixels, or a little less than a
+    cell."""
     side = np.linalg.norm(approximate - np.roll(approximate, 1, 1), axis=2).min(1)
-    return np.linalg.norm(xy - approximate, axis=2) < np.maximum(side / 7, 2.5)[:, None]
+    return (
+        np.linalg.norm(xy - approximate, axis=2)
+        < np.maximum(side / (cells_across + 1), 2.5)[:, None]
+    )
 
 
 def _fit_sides(

@@ -66,7 +66,7 @@ def find_match(
     **Raises:** `InputError` if the window or the whole segment is outside the images.
     """
     if any(v.model.unit != "px" or v.model.axes != "down" for v in (view, other_view)):
-        raise InputError("matching needs cameras in pixels, v down (opencv, kannala-brandt)")
+        raise InputError("matching needs cameras of models in pixels with v down")
     if not Zmin < Zmax:
         raise InputError(f"matching: Zmin {Zmin:g} must be below Zmax {Zmax:g}")
     if window < 3 or window % 2 == 0:

@@ -92,12 +92,14 @@ def find_ring_targets(
 
 def find_plain_discs(grey: Grey, coded: Sequence[Target], settings: RingSettings) -> list[Target]:
     """Light discs that are neither coded targets nor sectors of their rings."""
-    # The outermost parts of a ring are 3 radii from the centre.
-    return [
-        disc
-        for disc in find_discs(grey, settings)
-        if all(np.linalg.norm(disc.xy - t.xy) > 3.5 * t.axes[0] for t in coded)
-    ]
+    plain: list[Target] = []
+    for disc in find_discs(grey, settings):
+        # The outermost parts of a ring are 3 radii from the centre. Both outlines of the light
+        # ground about a dark patch lead to the disc in its middle again.
+        others = [(t.xy, 3.5 * t.axes[0]) for t in coded] + [(t.xy, t.axes.min()) for t in plain]
+        if all(np.linalg.norm(disc.xy - xy) > nearest for xy, nearest in others):
+            plain.append(disc)
+    return plain
 
 
 def find_discs(grey: Grey, settings: RingSettings) -> Iterator[Target]:

@@ -196,5 +196,5 @@ def noise_of(grey: Real[np.ndarray, "rows columns"]) -> float:
     # Laplacian of the Laplacian: 0 for linear and quadratic changes; its σ in noise of σ 1 is
     # √36 = 6, and 0.6745 the median of |x| of a normal x
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
-    response = scipy.ndimage.convolve(grey, mask)[1:-1, 1:-1]
+    response = scipy.ndimage.convolve(np.asarray(grey, float), mask)[1:-1, 1:-1]
     return max(float(np.median(np.abs(response)) / (6 * 0.6745)), 12**-0.5)

@@ -11,6 +11,7 @@ import render
 from jaxbundle.choices import DICTIONARIES
 from jaxbundle.errors import InputError
 from jaxbundle.measure import Board, find_board, measure_boards, read_photograph
+from jaxbundle.measure.board_sets import measure_board_set
 from jaxbundle.measure.coded_targets import check_kind
 from jaxbundle.measure.corners import is_chessboard, other_sizes
 
@@ -250,10 +251,12 @@ def test_a_board_in_a_fisheye_is_one():
 
 
 @pytest.mark.further
-def test_markers_of_another_dictionary_are_named():
+@pytest.mark.parametrize("first_marker", [0, 20])
+def test_markers_of_another_dictionary_are_named(first_marker):
     """The board drawn has DICT_4X4_50; the dictionaries are tried, the smallest that fits named."""
-    picture, _ = taken(CHARUCO, *POSES[2])
-    other = dataclasses.replace(CHARUCO, dictionary="DICT_6X6_250")
+    board = dataclasses.replace(CHARUCO, first_marker=first_marker)
+    picture, _ = taken(board, *POSES[2])
+    other = dataclasses.replace(board, dictionary="DICT_6X6_250")
     assert other_sizes(picture, other).dictionary == "DICT_4X4_50"
     assert other_sizes(np.full_like(picture, 128), other) is None
 
@@ -289,6 +292,14 @@ def test_a_board_whose_markers_do_not_begin_at_0():
     assert other_sizes(picture, CHARUCO) == board
     with pytest.raises(InputError, match="DICT_4X4_50 has 50 markers"):
         find_board(picture, dataclasses.replace(board, first_marker=30))
+
+
+@pytest.mark.parametrize("boards, said", [
+    ({}, "boards must be by name"), ({"a:b": CHESS}, "expected a name without a colon"),
+])  # fmt: skip
+def test_names_of_boards_are_checked_before_any_photograph_is_read(boards, said):
+    with pytest.raises(InputError, match=said):
+        measure_board_set(["none.jpg"], boards)
 
 
 def test_a_stretched_print_has_two_spacings():

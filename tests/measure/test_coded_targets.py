@@ -76,6 +76,16 @@ def test_plain_discs():
     assert np.linalg.norm(disc.xy - [92, 90]) < 0.1
 
 
+def test_a_plain_disc_on_a_dark_patch_is_found_once():
+    """The light ground about the patch has two outlines with the disc in their middle."""
+    grey = np.full((200, 300), 200, np.uint8)
+    for column in (80, 210):
+        cv2.circle(grey, (column, 100), 24, 40, -1, cv2.LINE_AA)
+        cv2.circle(grey, (column, 100), 8, 220, -1, cv2.LINE_AA)
+    discs = find_plain_discs(grey, [], RingSettings())
+    assert sorted(round(disc.xy[0]) for disc in discs) == [80, 210]
+
+
 def test_a_disc_without_a_ring_is_no_target():
     grey = np.full((80, 80), 30, np.uint8)
     cv2.circle(grey, (40, 40), 9, 220, -1, cv2.LINE_AA)

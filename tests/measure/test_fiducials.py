@@ -74,6 +74,24 @@ def test_points_follow_the_marks_and_weights_count():
     assert "affine transformation of 8 marks" in str(found)
 
 
+def test_a_mark_of_weight_0_is_as_good_as_none():
+    xy, kept = scanned(0.5), np.arange(8) != 2
+    found = fit_fiducials(xy, MARKS, weights=1.0 * kept)
+    without = fit_fiducials(xy[kept], MARKS[kept])
+    assert found.redundancy == without.redundancy == 8
+    assert found.sigma0 == pytest.approx(without.sigma0)
+    assert len(found.residuals) == 8
+
+
+@pytest.mark.parametrize("weights, said", [
+    ([1.0] * 7, "expected 8 weights"), ([-1.0] + [1.0] * 7, "one of 0 or more for each mark"),
+    ([1.0, 1.0] + [0.0] * 6, "2 fiducial marks of weight above 0 are too few for the affine"),
+])  # fmt: skip
+def test_weights_that_cannot_be_used(weights, said):
+    with pytest.raises(InputError, match=said):
+        fit_fiducials(scanned(), MARKS, weights=weights)
+
+
 @pytest.mark.usefixtures("wrong_types")
 @pytest.mark.parametrize("change, said", [
     (lambda a, b: (a[:2], b[:2]), "2 fiducial marks are too few for the affine"),

@@ -99,6 +99,8 @@ def test_threshold_and_noise():
     assert 80 < otsu(two) < 160
     slope = np.add.outer(np.arange(90.0), 2 * np.arange(90.0))
     assert noise_of(slope + 7 * rng.normal(size=(90, 90))) == pytest.approx(7, rel=0.06)
+    eight_bits = (100 + 7 * rng.normal(size=(90, 90))).astype(np.uint8)
+    assert noise_of(eight_bits) == pytest.approx(7, rel=0.06)
 
 
 def ellipse_points(centre, a, b, angle, t):
