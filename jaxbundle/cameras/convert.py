@@ -30,6 +30,7 @@ from jaxbundle.cameras.convert_wide import exact_wide
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
+from jaxbundle.cameras.validity import end_in_words
 from jaxbundle.display import print_anywhere
 from jaxbundle.types import Numbers
 
@@ -110,7 +111,7 @@ def convert_camera(
     if has_ray.mean() < MEASURABLE:
         raise ValueError(
             f"only {100 * has_ray.mean():.0f} % of the image has a ray in model {source.name!r}: "
-            "its distortion turns back inside the image"
+            f"its {' '.join(end_in_words(source))} inside the image"
         )
     target_images, rays = (shift + step * xy)[has_ray], rays[has_ray]
     if not target.wide and (rays[:, 2] >= 0).any():

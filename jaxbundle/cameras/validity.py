@@ -80,17 +80,25 @@ def validity_message(
     radius = turning_radius(model, parameters, half_diagonal)
     if radius is None:
         return None
-    subject, remedy = "distortion", "Free fewer distortion parameters"
-    turns = "turns back"
-    if "spline" in model.name:
-        subject, turns = "field", "ends, or its distortion turns back,"
-        remedy = "Choose a model with a wider field or more knots across"
+    subject, turns = end_in_words(model)
+    remedy = (
+        "Choose a model with a wider field or more knots across"
+        if subject == "field"
+        else "Free fewer distortion parameters"
+    )
     return (
         f"Camera {camera!r}: the {subject} of model {model.name!r} {turns} at a radius of "
         f"{radius:.4g} {model.unit} from the principal point, inside the image, whose half "
         f"diagonal is {half_diagonal:.4g} {model.unit}: points farther out have no valid image. "
         f"{remedy}, or measure points out to the corners."
     )
+
+
+def end_in_words(model: CameraModel) -> tuple[str, str]:
+    """What ends where points have no ray, and how: the field of a spline ends at its last knot."""
+    if "spline" in model.name:
+        return "field", "ends, or its distortion turns back,"
+    return "distortion", "turns back"
 
 
 @partial(compile_once, static=0)

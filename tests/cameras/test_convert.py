@@ -159,6 +159,13 @@ def test_a_fisheye_near_its_axis_and_beyond_ninety_degrees():
         ("brown", BROWN, "opencv", {"image_size": SIZE}, "pixel_size is needed"),
         ("brown", BROWN, "brown-projected", {}, "image_size is needed to know the area"),
         ("brown", BROWN | {"K1": -0.01, "r0": 0.0}, "usgs", SIZES, "turns back inside the image"),
+        (
+            "radial-spline-6-40",
+            {"fx": 300.0, "fy": 300.0, "cx": 320.0, "cy": 240.0},
+            "opencv",
+            {"image_size": (640, 480)},
+            "its field ends, or its distortion turns back, inside the image",
+        ),
     ],
 )
 def test_what_cannot_be_converted_is_said(source, values, target, sizes, message):
