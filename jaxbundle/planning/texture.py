@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import integer, number, positive
+from jaxbundle.errors import InputError
 
 Mask = Callable[[np.ndarray, np.ndarray], Bool[np.ndarray, "..."]]
 
@@ -50,7 +51,7 @@ class Texture:
         positive("texture: texel", self.texel)
         side = integer("texture: side", self.side, least=16, most=1 << 14)
         if side & (side - 1):
-            raise ValueError(f"texture: side must be a power of two, but is {side}")
+            raise InputError(f"texture: side must be a power of two, but is {side}")
         number("texture: contrast", self.contrast)
         if self.period is not None:
             positive("texture: period", self.period)

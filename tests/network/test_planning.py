@@ -113,6 +113,13 @@ def test_the_formula_is_the_right_order(block):
     assert mean["Z"] > mean["X"]
 
 
+def test_no_control_point_is_lost_by_relief(block):
+    """A point 20 % of the flying height above the datum is seen 25 % further from the nadir."""
+    camera = Camera("cam", "brown", {"c": 153.0})
+    network = planned_network(block[0], camera, (230, 230), (1900, 3500), 0.005, 0.05, relief=0.2)
+    assert sum(role == "control" for role in network.points.role) == 9
+
+
 def test_more_control_is_better_control(block):
     design, few = block
     camera = Camera("cam", "brown", {"c": 153.0})
