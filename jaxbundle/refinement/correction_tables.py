@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.network.tables import EXTERIOR, Network
 from jaxbundle.refinement import kinds
@@ -22,14 +23,15 @@ from jaxbundle.refinement.tables import RpcScannerImage
 
 
 class SharedUnknown(NamedTuple):
-    """An unknown that points share: its name, the σ of its prior (inf: none), and where it is among
-    the changes of the tables."""
+    """An unknown that points share: its name, the σ of its prior (inf: none), where it is among
+    the changes of the tables, and the change that the prior states."""
 
     name: UnknownName
     sigma: float
     table: str
     row: int
     direction: int
+    prior: float = 0.0
 
 
 class CorrectionTable(NamedTuple):
@@ -139,8 +141,11 @@ def columns_of_photographs(
         camera, (title, row) = network.cameras[c], of_cameras[network.cameras[c].id]
         if c in network.images.camera[:i]:  # named with its first image
             continue
+        start = {**default_parameters(get_model(camera.model)), **camera.parameters}
         for d in np.flatnonzero(table_of[title].free[row]).tolist():
             word = table_of[title].parameters[d]
             name = UnknownName(f"camera {camera.id}", word, "", 1.0, word)
-            columns.append(SharedUnknown(name, camera.sigma.get(word, math.inf), title, row, d))
+            prior = camera.observed[word] - start[word] if word in camera.observed else 0.0
+            sigma = camera.sigma.get(word, math.inf)
+            columns.append(SharedUnknown(name, sigma, title, row, d, prior))
     return columns

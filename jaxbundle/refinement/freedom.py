@@ -226,8 +226,10 @@ def middle_and_half(image: PushbroomImage) -> tuple[float, float]:
 def priors(form: Form, freedom: Freedom) -> Float[np.ndarray, " n"]:
     """The σ of every number of an image's vector; NaN where it has no such unknown."""
     room = lambda sigma, n: np.r_[sigma, np.full(n - len(sigma), np.nan)]
-    freedom_of_image, sizes, knots = freedom, form.sizes, form.spline.unknowns
-    jitter = [room(np.repeat(s, knots), sizes.jitter // 3) for s in freedom_of_image.jitter]
+    freedom_of_image, sizes, spline_unknowns = freedom, form.sizes, form.spline.unknowns
+    jitter = [
+        room(np.repeat(s, spline_unknowns), sizes.jitter // 3) for s in freedom_of_image.jitter
+    ]
     return np.concatenate(
         [
             freedom_of_image.attitude,

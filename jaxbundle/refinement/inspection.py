@@ -24,6 +24,10 @@ from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, not_none
 
+# Solutions with S and the cells of terrain heights at those before. S settles in two or three; a
+# point that goes to and fro between two cells never does.
+ROUNDS = 10
+
 
 class SharedUnknowns(eqx.Module):
     """The changes of the shared unknowns, as a function of the tables. `places`: by table,
@@ -66,8 +70,11 @@ class RefinementInspection:
         solution: Solution,
         steps: int,
         removed: Sequence[RemovedRow] = (),
+        unsettled: float = 0.0,
     ):
+        """`unsettled`: by what `DeclaredRefinement.rescale` still changes, 0 if by nothing."""
         self.declared, self.solution, self.steps = declared, solution, steps
+        self.unsettled = unsettled
         self.removed = tuple(_describe_removed(declared, blunder) for blunder in removed)
 
     @property
@@ -160,19 +167,20 @@ def adjust(
     """Solve, optionally remove blunders, and inspect the solution.
 
     **Raises:** `NotSolvedError` with the undetermined unknowns."""
-    steps = 0
+    steps, unsettled = 0, 0.0
 
     def adjust_from(problem: Problem, values: Values) -> Solution:
-        nonlocal steps
+        nonlocal steps, unsettled
         problem, _ = declared.rescale(problem, values)
         # S = −(∂g/∂(l, u))⁻¹ (`kinds`) is held during a solution: its own derivatives are second
         # ones of the trajectory, and v needs them nowhere. It is right when it is that of the
         # solution, within 1e-9 of itself; the second solution starts at the first, and is near it.
-        for _ in range(10):
+        for _ in range(ROUNDS):
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
             problem, change = declared.rescale(problem, values)
-            if not (change > 1e-9 and converged(minimum.termination)):
+            unsettled = change if change > 1e-9 else 0.0
+            if not (unsettled and converged(minimum.termination)):
                 break
         solution = Solution(problem, values)
         _require_solved(declared, solution, minimum, steps)
@@ -181,7 +189,7 @@ def adjust(
     solution, removed = adjust_from(declared.problem, declared.problem.data.start), []
     if snooping != "none":
         solution, removed = snoop(solution, adjust_from, test=snooping, significance=significance)
-    return RefinementInspection(declared, solution, steps, removed)
+    return RefinementInspection(declared, solution, steps, removed, unsettled)
 
 
 def _require_solved(
@@ -212,7 +220,7 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
     `Refinement.image_points`, others as in their sets (three per control point)."""
     inputs, chosen_points = declared.inputs, declared.rays.points
     names = [part.set for part in declared.parts]
-    points, set = inputs.points, declared.problem.observations_of(blunder.set)
+    points, observation_set = inputs.points, declared.problem.observations_of(blunder.set)
     if blunder.set in names:
         number = names.index(blunder.set)
         part = declared.parts[number]
@@ -225,13 +233,19 @@ def _describe_removed(declared: DeclaredRefinement, blunder: RemovedRow) -> Remo
         ]
         rows = [int(place[rows_before + r]) for r in blunder.rows]
         return Removed("image", rows[0], either_of(image_points), blunder.test, tuple(rows[1:]))
-    if set.kind.name == "control points":
+    if observation_set.kind.name == "control points":
         p, axis = int(declared.control[blunder.row]), not_none(blunder.residual)
-        name = f"{points.axis_names[axis]} of control point {points.id[chosen_points[p]]}"
-        return Removed("control", 3 * p + axis, name, blunder.test)
+        k = int(chosen_points[p])
+        name = f"{points.axis_names_of(k)[axis]} of control point {points.id[k]}"
+        return Removed("control", 3 * blunder.row + axis, name, blunder.test)
     if blunder.set == TERRAIN_HEIGHTS:
         p = int(declared.levelled[blunder.row])
         name = f"terrain height of point {points.id[chosen_points[p]]}"
         return Removed("terrain height", blunder.row, name, blunder.test)
-    a, b = (points.id[chosen_points[r[blunder.row]]] for r in set.rows)
-    return Removed("distance", blunder.row, f"distance {a}–{b}", blunder.test)
+    if observation_set.kind.name == "distances":
+        a, b = (points.id[chosen_points[r[blunder.row]]] for r in observation_set.rows)
+        return Removed("distance", blunder.row, f"distance {a}–{b}", blunder.test)
+    tables, (first_row, *others) = declared.problem.tables, blunder.rows
+    labels = [observation_set.label(tables, row) for row in blunder.rows]
+    kind = observation_set.kind.name
+    return Removed(kind, first_row, either_of(labels), blunder.test, tuple(others))

@@ -32,12 +32,17 @@ from jaxbundle.refinement.check_points import RefinementCheckPoints, intersect
 from jaxbundle.refinement.declare import declare
 from jaxbundle.refinement.freedom import UnknownName, change_of
 from jaxbundle.refinement.inputs import IMAGE, SENSOR, RefinementInput, gather
-from jaxbundle.refinement.inspection import RefinementInspection, adjust
+from jaxbundle.refinement.inspection import ROUNDS, RefinementInspection, adjust
 from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.report import report as describe_refinement
 from jaxbundle.refinement.report import to_json
 from jaxbundle.refinement.rpc_points import RPC_IMAGE, misclosures
-from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, with_frames
+from jaxbundle.refinement.tables import (
+    AnyScannerImage,
+    GroundPoints,
+    has_upright_checks,
+    with_frames,
+)
 from jaxbundle.refinement.terrain_heights import TERRAIN_HEIGHTS, HeightModel
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.results import TableMethods, finite
@@ -112,6 +117,12 @@ class Refinement(TableMethods):
         return np.array([column.sigma for column in self.inspection.declared.columns])
 
     @property
+    def prior_change(self) -> Float[np.ndarray, " m"]:
+        """The changes that the priors of these state: 0, unless a camera was observed elsewhere
+        than at its start values."""
+        return np.array([column.prior for column in self.inspection.declared.columns])
+
+    @property
     def removed(self) -> tuple[Removed, ...]:
         """Observations removed by data snooping, in the order of removal."""
         return self.inspection.removed
@@ -124,9 +135,9 @@ class Refinement(TableMethods):
     def rays(self) -> dict[int, int]:
         """The number of points used by their number of rays."""
         declared = self.inspection.declared
-        n, rows = len(declared.rays.points), declared.parts
+        n, parts = len(declared.rays.points), declared.parts
         number = np.zeros(n, int)
-        for part in rows:
+        for part in parts:
             has_weight = self.inspection.has_weight[part.set].any(1)
             number += np.bincount(part.point[has_weight], minlength=n)
         rays, points = np.unique(number, return_counts=True)
@@ -155,7 +166,11 @@ class Refinement(TableMethods):
                 if observation_set.name in images
                 else words.get(observation_set.kind.name)
             )
-            number[word or "priors"] += int(self.inspection.has_weight[observation_set.name].sum())
+            # Those of further kinds, unlike priors, are tested for blunders.
+            kind = observation_set.kind
+            word = word or (kind.name if kind.snooped else "priors")
+            weighted = int(self.inspection.has_weight[observation_set.name].sum())
+            number[word] = number.get(word, 0) + weighted
         free = {t.name: int((t.free > 0).sum()) for t in solution.problem.tables}
         of_points = free.pop("point")
         return number | {
@@ -329,7 +344,11 @@ def refine(
     rays, check_rays, warnings = choose_rays(points, observations, frames)
     inputs = gather(images, points, observations, frames, terrain)
     inspection = adjust(declare(inputs, rays, start_points(inputs, rays)), snooping, significance)
-    warnings += [*_without_terrain(inspection), *_outside_domains(inspection)]
+    warnings += [
+        *_without_terrain(inspection),
+        *_outside_domains(inspection),
+        *_unsettled(inspection),
+    ]
     for weak in weaknesses(inspection.declared, inspection.solution):
         warnings.append(f"{weak.sentence}; only priors, if any, separate them")
     check = intersect(inspection, check_rays) if len(check_rays.points) else None
@@ -341,7 +360,7 @@ def refine(
 
 def _beyond_priors(result: Refinement, significance: float) -> Iterator[str]:
     """Unknowns that leave their priors by more than chance explains, as a warning."""
-    ratio = np.abs(result.estimate) / result.prior_sigma
+    ratio = np.abs(result.estimate - result.prior_change) / result.prior_sigma
     limit = normal_quantile(1 - significance / 2)
     beyond = sorted(np.flatnonzero(ratio > limit), key=lambda k: -ratio[k])
     if beyond:
@@ -360,6 +379,16 @@ def _without_terrain(inspection: RefinementInspection) -> Iterator[str]:
         yield (
             f"{not_none(inputs.terrain).name} has no height at {count(len(ids), 'tie point')}, "
             f"adjusted without one: {list_some(ids)}"
+        )
+
+
+def _unsettled(inspection: RefinementInspection) -> Iterator[str]:
+    """That linearised observations still change, as a warning."""
+    if inspection.unsettled:
+        yield (
+            f"after {ROUNDS} rounds the heights of the terrain model still change by "
+            f"{inspection.unsettled:.2g} σ, or the scales of image points by as much of "
+            "themselves; look for tie points at steps of the terrain, or leave it out"
         )
 
 
@@ -386,11 +415,11 @@ def _outside_domains(inspection: RefinementInspection) -> Iterator[str]:
 
 def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoints:
     """The axes of check points as east, north, up, for points at a given height."""
-    if earth is None or earth.a != earth.b:
+    if not has_upright_checks(earth):
         return points
     # One ray at a given height leaves two unknowns, which must be along the surface of that height.
     axes, checks = points.axes.copy(), np.array(points.role, dtype=object) == "check"
-    axes[checks] = east_north_up(earth, points.X[checks])
+    axes[checks] = east_north_up(not_none(earth), points.X[checks])
     return dataclasses.replace(points, axes=axes)
 
 

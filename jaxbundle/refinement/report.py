@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbundle.leastsquares.quality.global_test import describe_test
 from jaxbundle.leastsquares.quality.reliability import minimal_detectable
-from jaxbundle.refinement.tables import UNIT_OF_WEIGHT
+from jaxbundle.refinement.tables import UNIT_OF_WEIGHT, has_upright_checks
 from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def to_json(result: "Refinement") -> dict:
                 "role": result.points.role[k],
                 "X": X,
                 "sigma": s,
-                "axes": list(result.points.axis_names),
+                "axes": list(result.points.axis_names_of(k)),
             }
             for k, X, s in zip(
                 inspection.declared.rays.points,
@@ -182,8 +182,7 @@ def _tests(rows: list[dict], number: int) -> Iterator[str]:
 
 def _checks(result: "Refinement") -> Iterator[str]:
     c = not_none(result.check)
-    earth = result.images[0].earth is not None
-    names = ("east", "north", "up") if earth else ("X", "Y", "Z")
+    names = ("east", "north", "up") if has_upright_checks(result.images[0].earth) else "XYZ"
     yield f"Check points, computed − given ({', '.join(names)}; m)"
     for id, d, s, n in zip(c.id, c.difference, c.sigma, c.rays):
         cells = " ".join(

@@ -78,6 +78,12 @@ class GroundPoints:
     def __len__(self) -> int:
         return len(self.id)
 
+    def axis_names_of(self, row: int) -> tuple[str, str, str]:
+        """The names of the axes of a point: X, Y, Z also beside others, of points that were given
+        without coordinates or come from photographs."""
+        along_coordinates = (self.axes[row] == np.eye(3)).all()
+        return ("X", "Y", "Z") if along_coordinates else self.axis_names
+
 
 def local_points(
     id: Sequence[str],
@@ -114,6 +120,11 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
         points.axis_names,
         points.source,
     )
+
+
+def has_upright_checks(earth: Ellipsoid | None) -> bool:
+    """Whether check points are compared along east, north, up: above an ellipsoid of revolution."""
+    return earth is not None and earth.a == earth.b
 
 
 def check_points_table(points: GroundPoints) -> None:
@@ -200,9 +211,9 @@ def _check_on_image(
     row = int(is_off.any(1).argmax())
     k, i = int(is_off[row].argmax()), observations.image[row]
     scanner_image, (low, high) = images[i], limits[row, k]
-    rows = observations.image == i
+    is_of_image = observations.image == i
     hint = ""
-    if len(rows) > 1 and is_inside(observations.xy[:, ::-1])[rows].all():
+    if is_of_image.sum() > 1 and is_inside(observations.xy[:, ::-1])[is_of_image].all():
         hint = "; exchanged, line and pixel of all its points would be on it: check the columns"
     size = (scanner_image.image.lines, scanner_image.image.pixels)[k]
     sized = not isinstance(scanner_image.image, RpcImage) or scanner_image.image.sized

@@ -52,15 +52,15 @@ class WeakDirection(NamedTuple):
 def weaknesses(
     declared: DeclaredRefinement, solution: Solution, settings: WeaknessSettings = DEFAULTS
 ) -> list[WeakDirection]:
-    """All weak directions, the weakest first; jitter is one per axis."""
-    S, names = _observe(declared, solution)
+    """All weak directions, the weakest first; of the jitter of an axis only the weakest."""
+    S, names = _matrix_without_priors(declared, solution)
     if not np.isfinite(S).all():
         # A point that its own observations leave open, so that it could not be eliminated.
         vague = undetermined_unknowns(solution.problem, solution.values)
         sentence = f"the points do not determine {', '.join(vague[: settings.most_named])}"
         return [WeakDirection(0.0, tuple(vague), sentence)]
     values, vectors = np.linalg.eigh(S)
-    weak, jitter = [], set()
+    weak, jitter = [], set()  # `jitter`: what is listed already
     for value, vector in zip(values, vectors.T):
         if value >= settings.weak_eigenvalue:
             break
@@ -70,34 +70,33 @@ def weaknesses(
             : settings.most_named
         ]
         is_null = bool(value < settings.null_eigenvalue)
-        if " jitter of " in named_unknowns[0]:
+        if _is_jitter(named_unknowns[0]):
             # Many directions of one spline: one sentence.
-            jitter.add((named_unknowns[0], is_null))
-            continue
+            named_unknowns = named_unknowns[:1]
+            if named_unknowns[0] in jitter:
+                continue
+            jitter.add(named_unknowns[0])
         weak.append(
             WeakDirection(
                 float(value), tuple(named_unknowns), _sentence(named_unknowns, value, is_null)
             )
         )
-    for name in sorted({name for name, _ in jitter}):
-        is_listed = (name, True) in jitter
-        value = 0.0 if is_listed else float(values[0])
-        sentence = (
-            f"the points leave parts of the {name} undetermined, so that only its prior holds it; "
-            "use wider knot spacing or more points"
-        )
-        weak.append(WeakDirection(value, (name,), sentence))
     return weak
+
+
+def _is_jitter(name: str) -> bool:
+    return " jitter of " in name
 
 
 def _sentence(named_unknowns: list[str], value: float, null: bool) -> str:
     how = "do not determine" if null else "hardly determine"
-    text = f"the points {how} the {named_unknowns[0]}"
+    jitter = _is_jitter(named_unknowns[0])
+    text = f"the points {how} {'parts of ' if jitter else ''}the {named_unknowns[0]}"
     if named_unknowns[1:]:
         text += f" against {', '.join(named_unknowns[1:])}"
-    if null:
-        return text
-    return f"{text} (σ {1 / np.sqrt(value):.2g} times as large as of one alone)"
+    if not null:
+        text += f" (σ {1 / np.sqrt(value):.2g} times as large as of one alone)"
+    return f"{text}; use wider knot spacing or more points" if jitter else text
 
 
 def _shares(vector: Float[np.ndarray, " m"], names: list[UnknownName]) -> list[tuple[str, float]]:
@@ -110,7 +109,7 @@ def _shares(vector: Float[np.ndarray, " m"], names: list[UnknownName]) -> list[t
     return sorted(((n, float(np.sqrt(s))) for n, s in total.items()), key=lambda x: -x[1])
 
 
-def _observe(
+def _matrix_without_priors(
     declared: DeclaredRefinement, solution: Solution
 ) -> tuple[Float[np.ndarray, "m m"], list[UnknownName]]:
     """The scaled reduced normal matrix without priors, of the shared unknowns, and their names;
@@ -129,7 +128,8 @@ def _observe(
     is_kept = np.array([place in columns for place in places])
     points = np.array([place[0] == "point" for place in places])
     cross = S[np.ix_(is_kept, points)]
-    # The pseudoinverse: what no observation determines of these points is not eliminated.
+    # The pseudoinverse: what no observation determines of these points is not eliminated. Below
+    # 1e-13 of the largest, some hundred eps, an eigenvalue is rounding.
     explained_part = (
         cross @ np.linalg.pinv(S[np.ix_(points, points)], 1e-13, hermitian=True) @ cross.T
     )

@@ -82,7 +82,8 @@ def test_matches_and_control_become_a_refinement(folder):
     assert points.role.count("control") == 6 and set(points.role) == {"control", "tie"}
     np.testing.assert_allclose(points.X[:6], scene.X[:6], atol=5)
     assert file.warnings == (
-        f"{path / 'control.gcp'}: measurements in images that are not in [images]: other.tif",
+        f"{path / 'control.gcp'}: measurements in images that are not in [images], or whose name "
+        "several of them have: other.tif",
     )
     # a place of the middle image that is in both files makes one point with three rays
     rays = np.bincount(seen.point)

@@ -56,6 +56,7 @@ attitude_rate = "held"
 """
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -138,9 +139,12 @@ def read_refinement(path: str | Path) -> RefineFile:
     frames = None
     if "frames" in section:
         frames = read_network(section.path("frames", "a project of photographs", folder=True))
-    # Other programs name an image by its file, without folder and suffix.
+    # Other programs name an image by its file, without folder and suffix, unless several images
+    # have files of that name.
     sources = {image.id: file.section("images").path(image.id, "an image") for image in images}
-    names = {re.sub("(?i)_rpc$", "", sources[image.id].stem): image.id for image in images}
+    stems = {id: re.sub("(?i)_rpc$", "", source.stem) for id, source in sources.items()}
+    number_of = Counter(stems.values())
+    names = {stem: id for id, stem in stems.items() if number_of[stem] == 1}
     names |= {image.id: image.id for image in images}
     serial = file.section("serial_numbers")
     for id in serial.values:

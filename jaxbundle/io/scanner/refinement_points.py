@@ -60,7 +60,10 @@ def read_points(
         table, unknown = _measured_control(control, path, names)
         tables.append(table)
         if unknown:
-            warnings.append(f"{path}: measurements in images that are not in [images]: {unknown}")
+            warnings.append(
+                f"{path}: measurements in images that are not in [images], or whose name several "
+                f"of them have: {unknown}"
+            )
     if by_suffix[MATCH]:
         table, ties, match_warnings = _matched_points(
             by_suffix[MATCH], names, [image.id for image in images]
