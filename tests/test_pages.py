@@ -79,7 +79,8 @@ def test_the_table_of_a_batch_has_every_row(rows):
      "The result does not meet its tests: Results."),
 ])  # fmt: skip
 def test_the_verdict_of_a_batch(rows, verdict):
-    assert verdict in Page("".join(compose_batch(rows))).texts["p"]
+    text = "".join(compose_batch(rows))
+    assert verdict in Page(text).texts["p"] and "of these 0" not in text
 
 
 def test_lines_of_other_inputs_are_not_of_the_batch(tmp_path, rows):

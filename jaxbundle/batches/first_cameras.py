@@ -185,14 +185,16 @@ def _fit(
 ) -> dict[str, float]:
     """Parameters of a model fitted to the images of the computed camera, over the measured area;
     for a model with priors, all parameters with a prior, over the whole image if possible."""
-    conventions = dict(given_values)
+    held_values = dict(given_values)
     if model.prior:
         # Held, whatever it is; near the true one, so that knots without points, which stay at 0,
         # are like their neighbours.
         centre = {name: first_camera.interior[name] for name in ("cx", "cy")}
-        conventions = {n: v for n, v in centre.items() if n in model.parameters} | conventions
-    if {*conventions} - {*model.principal_distance}:
-        model = dataclasses.replace(model, defaults=dict(model.defaults) | conventions)
+        held_values = {n: v for n, v in centre.items() if n in model.parameters} | held_values
+    # A principal distance has no default: a given one replaces that of the fit in the end, and the
+    # adjustment finds what goes with it.
+    if {*held_values} - {*model.principal_distance}:
+        model = dataclasses.replace(model, defaults=dict(model.defaults) | held_values)
     core = () if model.prior else model.principal_distance
     fitted_names = [n for n in model.parameters if n in (*core, *free) and n not in given_values]
     areas = [(xy.min(0), xy.max(0))]
@@ -200,7 +202,7 @@ def _fit(
     # that. Models with priors (splines) first over the whole image, where every knot gets a value.
     for area in [None, *areas] if model.prior else areas:
         try:
-            cost = convert_camera(
+            conversion = convert_camera(
                 first_camera.model,
                 first_camera.interior,
                 model,
@@ -212,7 +214,7 @@ def _fit(
         except ValueError as error:
             problem = error
         else:
-            return dict(cost.parameters)
+            return dict(conversion.parameters)
     hint = (
         "choose a larger field of view"
         if "spline" in model.name

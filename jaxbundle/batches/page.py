@@ -69,8 +69,9 @@ def _judge(population: Population) -> list[Finding]:
     total, solved, fit = len(population), int(population.solved.sum()), int(population.fit.sum())
     state = BAD if not solved else GOOD if solved == total else DOUBTFUL
     findings = [Finding("Results", state, f"{solved} of {count(total, 'input')} have values")]
-    words = f"weak or misfit: {solved - fit} of these {solved}"
-    findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
+    if solved:
+        words = f"weak or misfit: {solved - fit} of these {solved}"
+        findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
     limit = population.settings.outlier_limit
     number_far = int((np.nan_to_num(population.farthest) > limit).sum())
     if np.isfinite(population.farthest).any():
@@ -141,8 +142,7 @@ def _parameters(population: Population) -> list[Section]:
 def _histograms(population: Population) -> Iterator[str]:
     for name, values in population.values.items():
         edges, counted = population.histogram(values)
-        has_enough = counted.sum() >= population.settings.min_cameras
-        if has_enough and np.isfinite(edges[1:-1]).all() and len(edges) > 4:
+        if counted.sum() >= population.settings.min_cameras:
             yield figure(
                 draw_histogram(edges, counted, name, "number of cameras"),
                 f"{name} of {counted.sum()} converged cameras",

@@ -114,7 +114,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
                 continue
             mask = name == "visible"
             numeric_array(name, arrays[name], "true or false" if mask else "numbers", truths=mask)
-        if isinstance(X, StoredRows) and X.shape[:2] != xy.shape[:3:2]:
+        if isinstance(X, StoredRows) and X.shape[:2] != xy.shape[:1] + xy.shape[-2:-1]:
             X = X[np.arange(len(X))]  # the points of a view each
         if xy.ndim == 5:
             cameras, _ = check_rigs(X, xy, size, visible, cameras)

@@ -46,7 +46,15 @@ from jaxbundle.system.workers import Workers
 RIGS_A_WRITE = 32
 SIGMA_IMAGE = "sigma_image"
 # Settings present only in lines computed with them.
-WHERE_GIVEN = ("snooping", "significance", "pixel_size", "set", "sigma_image", *SECTIONS)
+WHERE_GIVEN = (
+    "snooping",
+    "significance",
+    "correlated",
+    "pixel_size",
+    "set",
+    "sigma_image",
+    *SECTIONS,
+)
 # Called with the share of the work that is done, 0 to 1.
 ShareDone = Callable[[float], None]
 

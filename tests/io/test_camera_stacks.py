@@ -7,6 +7,7 @@ import pytest
 
 from jaxbundle.batches.stacks import read_camera_stack
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.stored_rows import StoredRows
 
 
 def arrays(cameras, xy):
@@ -76,6 +77,14 @@ def test_big_arrays_are_read_where_they_lie(tmp_path):
             np.testing.assert_array_equal(found[name], known[name])
         np.testing.assert_array_equal(found["image_points"], xy[chosen])
     assert stored.fingerprint(899) == packed.fingerprint(899)
+
+
+def test_points_of_each_rig_are_read_where_they_lie(tmp_path):
+    """Of 1000 rigs of 2 cameras with an epoch of 50 points: a megabyte of them."""
+    given = arrays(1000, np.zeros((1000, 2, 1, 50, 2)))
+    given |= {"visible": np.ones((1000, 2, 1, 50), bool), "object_points": np.ones((1000, 50, 3))}
+    np.savez(tmp_path / "a.npz", **given)
+    assert isinstance(read_camera_stack(tmp_path / "a.npz").object_points, StoredRows)
 
 
 def test_a_byte_that_was_changed_is_found(tmp_path):
