@@ -130,15 +130,16 @@ def calibrate(  # noqa: PLR0913 keyword arguments of a public function
     while True:
         start = start_values(views, camera_model, free, pixel_size, given)
         start_camera = dataclasses.replace(start_camera, parameters=start.parameters)
-        views, result = _adjust_views(start, start_camera, network_of, options)
-        is_misfitting = _misfitting_views(views, result)
+        centred, result = _adjust_views(start, start_camera, network_of, options)
+        is_misfitting = _misfitting_views(centred, result)
         # Fewer than two would be left: nothing says which are right.
-        if not is_misfitting.any() or is_misfitting.sum() > len(views) - 2:
+        if not is_misfitting.any() or is_misfitting.sum() > len(centred) - 2:
             break
-        views = views.take(~is_misfitting, MISFITTING)
+        # As measured: the eccentricity of circles is corrected again, with the better camera.
+        views = start.views.take(~is_misfitting, MISFITTING)
     if truth("correlated", correlated):
         result = result.with_correlated_errors("views")
-    return Calibration(views, result, cross_validation)
+    return Calibration(centred, result, cross_validation)
 
 
 MISFITTING = (

@@ -17,7 +17,7 @@ if rays may be 90° and more from the axis; the error is a comment in the TOML.
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,6 +89,21 @@ def file_name(name: str) -> str:
     """A name that is valid in a file system."""
     # ASCII, not hidden, and short: camera names are free text, and folders go to other systems
     return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).strip("._")[:60] or "camera"
+
+
+def check_names(cameras: Iterable[str]) -> None:
+    """Refuse cameras that would share an output folder.
+
+    **Raises:** `InputError`."""
+    folders: dict[str, str] = {}
+    for name in cameras:
+        # Some systems do not tell the letters of a name from capitals.
+        earlier = folders.setdefault(file_name(name).casefold(), name)
+        if earlier != name:
+            raise InputError(
+                f"cameras {earlier!r} and {name!r} would have the same folder "
+                f"{file_name(name)!r}; choose other names (--camera)"
+            )
 
 
 def files_of(names: Sequence[str]) -> list[str]:
@@ -217,10 +232,14 @@ def fill_calibrations(
     progress: Progress | None = None,
 ) -> None:
     """Write a calibration into an existing folder; `origin` is for report and page, `choice` for
-    the page."""
+    the page.
+
+    **Raises:** `InputError` for cameras that would share a folder."""
     if len(calibrations.cameras) == 1 and calibrations.rig is None:
         calibration = next(iter(calibrations.cameras.values()))
         return _fill(calibration, folder, plots, origin, choice, progress)
+    rig_names = [] if calibrations.rig is None else calibrations.rig.names
+    check_names({**calibrations.cameras, **dict.fromkeys(rig_names)})
     for name, calibration in calibrations.cameras.items():
         _fill(calibration, folder / file_name(name), plots, origin, progress=progress)
     write_text(folder / REPORT, head_line(origin) + calibrations.report())

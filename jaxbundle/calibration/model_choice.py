@@ -242,7 +242,11 @@ def compare_models(
             f"{len(common)} photographs can be used by all models; {folds} folds need "
             f"{needed} at least: give more, or fewer folds"
         )
-    gross = set.intersection(*map(_removed_points, calibrations.values()))
+    # Of robust calibrations, whose weights would differ between the models, by data snooping.
+    significance = options.get("significance", 0.001)
+    gross = set.intersection(
+        *(_gross_points(calibration, significance) for calibration in calibrations.values())
+    )
     candidates = []
     for name, calibration in calibrations.items():
         candidate = _candidate(name, calibration, common, gross, folds)
@@ -273,9 +277,14 @@ def _calibrate_all(
     return calibrations, failures
 
 
-def _removed_points(calibration: Calibration) -> set[tuple[str, str]]:
-    """Image and point of removed gross errors."""
+def _gross_points(calibration: Calibration, significance: float) -> set[tuple[str, str]]:
+    """Image and point of gross errors: those that were removed; of a robust calibration those that
+    data snooping removes."""
     adjustment = calibration.adjustment
+    if adjustment.robust is not None:
+        network = adjustment.problem.network
+        network = start_at_result(network, adjustment, np.ones(len(network.observations), bool))
+        adjustment = adjust(network, snooping="pope", significance=significance)
     ids = _ids(adjustment.problem.network)
     return {ids[i] for i in np.flatnonzero(~used_rays(adjustment.problem))}
 

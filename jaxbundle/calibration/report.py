@@ -13,6 +13,7 @@ from jaxbundle.calibration.verdict import (
 from jaxbundle.io.results.result_json import result_dict, verdict_dict
 from jaxbundle.measure.boards import Board, BoardSet
 from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.blunders import removed_rays
 from jaxbundle.network.columns import count
 from jaxbundle.report.head import first_facts
 from jaxbundle.report.layout import (
@@ -100,7 +101,7 @@ def _camera(calibration: "Calibration") -> list[str]:
             rows.append((name, significant(value, DIGITS_WITHOUT_SIGMA), "held"))
     lines += table(("parameter", "value", "σ"), rows, "lrr")
     rms = calibration.rms
-    number_removed = len(calibration.adjustment.removed)
+    number_removed = len(removed_rays(calibration.adjustment.removed))
     # The first as OpenCV states it, the second to compare with σ of a coordinate.
     lines += ["", f"RMS of an image point {rms:.4f} px, of a coordinate {rms / np.sqrt(2):.4f} px"]
     lines += (

@@ -197,9 +197,9 @@ class Calibration(TableMethods):
         """|value|/σ of the free parameters."""
         return {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
 
-    @functools.cached_property
+    @property
     def shortcomings(self) -> list[str]:
-        """Warnings in words."""
+        """Warnings in words, on the halves of the photographs once `cross_validation` was made."""
         warnings = advice(
             self.position,
             self.rotation,

@@ -14,7 +14,7 @@ from jaxbundle.calibration.files import (
     REPORT,
     RESULT,
     calibrations_dict,
-    file_name,
+    check_names,
     files_of,
     fill_calibrations,
     fill_comparison,
@@ -224,19 +224,6 @@ def require_solved(calibrations: Calibrations) -> None:
             "parameters (--free), or take photographs from more "
             f"directions{others_in_words if len(failed) > 1 else ''}"
         )
-
-
-def check_names(cameras: Iterable[str]) -> None:
-    """Refuse cameras that would share an output folder."""
-    folders: dict[str, str] = {}
-    for name in cameras:
-        # Some systems do not tell the letters of a name from capitals.
-        earlier = folders.setdefault(file_name(name).casefold(), name)
-        if earlier != name:
-            raise InputError(
-                f"--camera: {earlier!r} and {name!r} would have the same folder "
-                f"{file_name(name)!r}; choose other names"
-            )
 
 
 def words(text: str) -> list[str]:

@@ -1,6 +1,8 @@
 """From rendered photographs and from corners: truth, OpenCV, boards that are not known, errors."""
 
 import dataclasses
+import importlib
+from types import SimpleNamespace
 
 import board_photographs as taken
 import cv2
@@ -13,6 +15,7 @@ from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.calibration import Board, BoardViews, calibrate
 from jaxbundle.calibration.affinity import find_missing_affinity
 from jaxbundle.calibration.calibrate import board_network
+from jaxbundle.calibration.model_choice import _gross_points
 from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
@@ -181,6 +184,25 @@ def test_circles_lose_their_eccentricity():
     assert abs(calibrate(plain, snooping=None).parameters["fx"] - TRUTH["fx"]) > 0.02
 
 
+def test_without_a_misfitting_photograph_the_circles_are_those_measured(monkeypatch):
+    """Not those from which the eccentricity was taken in the round before it was excluded."""
+    module = importlib.import_module("jaxbundle.calibration.calibrate")
+    measured, taken_in = simulated(), []
+
+    def adjust_views(start, *_):
+        taken_in.append(start.views.xy)
+        return dataclasses.replace(start.views, xy=start.views.xy - 0.1), None
+
+    misfits = iter([np.arange(VIEWS) == 3, np.zeros(VIEWS - 1, bool)])
+    start = lambda views, *_: SimpleNamespace(views=views, parameters={})
+    monkeypatch.setattr(module, "start_values", start)
+    monkeypatch.setattr(module, "_adjust_views", adjust_views)
+    monkeypatch.setattr(module, "_misfitting_views", lambda *_: next(misfits))
+    found = calibrate(measured, correlated=False)
+    np.testing.assert_array_equal(taken_in[1], np.delete(measured.xy, 3, 0))
+    np.testing.assert_allclose(found.views.xy, np.delete(measured.xy, 3, 0) - 0.1)
+
+
 def test_gross_errors_are_removed():
     views = simulated()
     rng = np.random.default_rng(8)
@@ -204,6 +226,10 @@ def test_gross_errors_count_little():
     found = calibrate(dataclasses.replace(views, xy=xy), robust="tukey")
     assert not found.adjustment.removed
     assert max(map(abs, normalised(found, TRUTH).values())) < 4
+    # Models are compared without them: whatever is ten σ off.
+    rows = np.argwhere((np.abs(xy - views.xy) > 10 * NOISE).any(2))
+    gross = {(f"view {v}", taken.BOARD.ids[p]) for v, p in rows}
+    assert gross <= _gross_points(found, 0.001)
     spoilt = calibrate(dataclasses.replace(views, xy=xy), snooping=None)
     assert abs(spoilt.parameters["fx"] - TRUTH["fx"]) > abs(found.parameters["fx"] - TRUTH["fx"])
 

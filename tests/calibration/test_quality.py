@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+from types import SimpleNamespace
 
 import board_photographs as taken
 import numpy as np
@@ -18,7 +19,8 @@ from jaxbundle.adjustment.quality.expected_difference import expected_difference
 from jaxbundle.adjustment.quality.projection_uncertainty import images_through_scene
 from jaxbundle.batches.calibrate import calibrate_batch
 from jaxbundle.batches.calibrate_rigs import calibrate_rigs
-from jaxbundle.calibration import calibrate
+from jaxbundle.calibration import Calibration, calibrate, report
+from jaxbundle.calibration import result as results
 from jaxbundle.calibration.advice import (
     advice,
     many_not_used,
@@ -26,7 +28,7 @@ from jaxbundle.calibration.advice import (
     often_removed,
     suggest,
 )
-from jaxbundle.calibration.files import json_text, write_calibration
+from jaxbundle.calibration.files import json_text, write_calibration, write_calibrations
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.calibration.simulate import simulate_views
 from jaxbundle.cameras import compare_cameras, get_model
@@ -261,6 +263,33 @@ def test_two_halves_agree_unless_the_camera_changed(calibration):
     # Not the largest, which is in a corner of the image without points.
     assert changed.cross_validation.comparison.rms > 10 * found.comparison.rms
     assert any("halves of the photographs contradict" in text for text in changed.advice)
+
+
+def test_halves_are_advised_about_once_they_were_made(calibration, monkeypatch):
+    """Also if the advice was read before."""
+    found = Calibration(calibration.views, calibration.adjustment, True)
+    monkeypatch.setattr(results, "advice", lambda *given: ["halves"] * (given[-1] is not None))
+    monkeypatch.setattr(results.quality, "cross_validation", lambda _: "made")
+    assert "halves" not in found.shortcomings
+    assert found.cross_validation == "made" and "halves" in found.shortcomings
+
+
+def test_removed_image_points_are_counted():
+    """Two inseparable ones are both removed; a coordinate of a control point is none."""
+    network = SimpleNamespace(cameras=[SimpleNamespace(model="opencv")])
+    removed = [SimpleNamespace(kind="image", rows=(3, 8)), SimpleNamespace(kind="X", rows=(1,))]
+    given = SimpleNamespace(
+        adjustment=SimpleNamespace(network=network, removed=removed),
+        parameters={}, stated_sigma={}, rms=0.1,
+    )  # fmt: skip
+    assert "Removed as gross errors: 2 image points" in report._camera(given)
+
+
+def test_cameras_with_one_folder_are_refused(tmp_path):
+    given = SimpleNamespace(cameras={"a b": None, "A_b": None}, rig=None)
+    with pytest.raises(InputError, match="'a b' and 'A_b' would have the same folder 'A_b'"):
+        write_calibrations(given, tmp_path / "out", plots=False)
+    assert not (tmp_path / "out").exists()
 
 
 def test_coverage_counts_cells_and_corners():
