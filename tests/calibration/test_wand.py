@@ -131,6 +131,7 @@ def test_markers_without_names_are_told_apart():
 def test_two_markers_that_look_alike():
     """Their rays tell which is which in all cameras of a frame; a camera whose frames are not
     simultaneous agrees with none."""
+    ends = {("right", "left"): 0.5}
     two = {"A": 0.0, "C": 0.5}
     rng = np.random.default_rng(0)
     given = {}
@@ -139,15 +140,16 @@ def test_two_markers_that_look_alike():
         given[name] = [marks[k] for k in rng.permutation(len(marks))]
     right = {(m.x, m.y): m.marker for own in given.values() for m in own}
     nameless = {name: [m._replace(marker="") for m in own] for name, own in given.items()}
-    found, _ = name_markers(nameless, CAMERAS, {("A", "B"): 0.5}, WandSettings())
+    found, _ = name_markers(nameless, CAMERAS, ends, WandSettings())
     by_frame = {}
     for own in found.values():
         for m in own:
             by_frame.setdefault(m.frame, set()).add((m.marker, right[m.x, m.y]))
     # the same end has the same name in all cameras of a frame
     assert len(by_frame) > 35 and all(len(names) == 2 for names in by_frame.values())
+    assert {m.marker for own in found.values() for m in own} == {"left", "right"}
     late = [m._replace(frame=str((int(m.frame) + 7) % 40)) for m in nameless["c3"]]
-    again, said = name_markers(nameless | {"c3": late}, CAMERAS, {("A", "B"): 0.5}, WandSettings())
+    again, said = name_markers(nameless | {"c3": late}, CAMERAS, ends, WandSettings())
     assert not again["c3"] and again["c0"] and "do not tell the two markers apart" in said[0]
 
 

@@ -1,6 +1,7 @@
 """A wand and boards in one rig: cameras that see boards, and cameras that see only the wand."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import wand_scenes as scenes
 import jaxbundle
 from jaxbundle.calibration import Wand
 from jaxbundle.calibration.rig.declare import ROLLS
-from jaxbundle.calibration.rig.wand_body import _ends, _stick_to_rig
+from jaxbundle.calibration.rig.wand_body import _ends, _stick_to_rig, add_wand
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_rotation_vector, quaternion_from_matrix
 from jaxbundle.leastsquares import Pose, PoseValue
@@ -61,7 +62,12 @@ def test_what_is_refused(tmp_path):
     wand = Wand(marks, LENGTHS, 1e-4)
     for options in ({"synchronize": "offset", "times": 30.0}, {"board_free": True}):
         with pytest.raises(InputError, match="wand: expected cameras that are synchronised"):
-            jaxbundle.calibrate_rig(views, wand=wand, **options)
+            # Before the photographs are searched.
+            jaxbundle.calibrate_rig(dict.fromkeys(views, tmp_path / "none"), wand=wand, **options)
+    markers = SimpleNamespace(markers={})
+    seen = SimpleNamespace(ends=("A", "C"), points=lambda _: {}, calibration=markers)
+    with pytest.raises(InputError, match="no frame shows both ends of it, 'A' and 'C', to two"):
+        add_wand(SimpleNamespace(cameras=()), seen, SimpleNamespace(mountings=[]), {})
     from jaxbundle.cli.calibrate_rig import wand_given
 
     one = (["c0=a.csv"], ["0.5"], None, None, {"c0": ""}, "m", None)

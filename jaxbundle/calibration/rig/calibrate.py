@@ -118,10 +118,9 @@ def calibrate_rig(  # noqa: PLR0913 - what a rig may be given by
         bodies = require_lists("bodies", bodies, "{'room': ['front', 'rear']}")
     if fixed and bodies:
         raise InputError("fixed: all boards are one body; give either fixed or bodies")
-    views, declared = views_of_camera(photographs, board, seen_by, progress)
-
     if wand is not None and (unknowns or options.get("board_free")):
         raise InputError("wand: expected cameras that are synchronised, and boards that are known")
+    views, declared = views_of_camera(photographs, board, seen_by, progress)
     calibrations = _calibrate_cameras(views, options, progress)
     shared_options = {name: options[name] for name in SHARED if name in options}
     if options.get("robust") and not shared_options.get("snooping"):

@@ -122,9 +122,9 @@ def start_unsynchronized(
     row_time = time[[number[name] for name in rig.epoch_of_rows]]
     camera_of = {name: k for k, camera in enumerate(cameras) for name in camera.epoch}
     camera = np.array([camera_of[name] for name in rig.epoch_of_rows])
-    centres = {name: board.points for name, board in boards.boards.items()}
+    points_of_boards = [board.points for board in boards.boards.values()]
     spacing = max(
-        _knots(views, [*centres.values()], time, float(np.median(frame))) / settings.undersmoothing,
+        _knots(views, points_of_boards, time, float(np.median(frame))) / settings.undersmoothing,
         settings.least_frames * float(np.median(frame)),
     )
     sigma0 = float(
@@ -150,9 +150,8 @@ def with_trajectory(rig: Rig, trajectory: TargetMotion, pose: PoseValue, spacing
     clocks = trajectory.clocks
     common = clocks.common(trajectory.camera, trajectory.time)
     body = _body_of_rows(rig)
-    # An interval without photographs leaves control poses open; 1.5 frames: if knots are closer
-    # than frames, runs still end only where a frame is missing.
-    runs, run = plan_runs(body, common, spacing, max(spacing, 1.5 * trajectory.frame))
+    # An interval without photographs leaves control poses open.
+    runs, run = plan_runs(body, common, spacing, spacing)
     if not runs:
         raise InputError(
             f"no board is photographed at {2 * CONTROLS} times in a row, with less than "
@@ -264,6 +263,8 @@ def _knots(
         X = boards[board] - boards[board].mean(0)
         corners = X[[0, int(np.argmax(X @ [1, -1, 0])), len(X) - 1]]
         places = np.einsum("nij,pj->npi", T[:, :3, :3], corners) + T[:, None, :3, 3]
+        # A part ends where a frame is missing. With fewer than ten photographs a spline of the
+        # closest knots has no AIC, and one such part would rule these out for all.
         ends = np.flatnonzero(np.diff(t) > 1.5 * frame) + 1
         parts_of_track = zip(np.split(t, ends), np.split(places.reshape(len(t), 9), ends))
         parts += [(a, b) for a, b in parts_of_track if len(a) >= 4 * CONTROLS]

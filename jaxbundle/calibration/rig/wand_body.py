@@ -201,6 +201,12 @@ def add_wand(
                 marks_of_frame[mark.frame].append((names.index(name), point, mark))
     # Two markers in two cameras: with fewer rays a pose of five unknowns is not checked.
     frames = [frame for frame, rows in marks_of_frame.items() if len(rows) >= 4]
+    if not frames:
+        raise InputError(
+            f"wand: no frame shows both ends of it, {' and '.join(map(repr, wand.ends))}, to two "
+            "cameras; expected some that do, or the length of a pair of markers that such frames "
+            "show"
+        )
     poses = np.array([_stick_to_rig(*ends[frame]) for frame in frames])
     rows = [
         (len(rig.epochs) + e, *row)

@@ -90,7 +90,7 @@ def name_markers(
         if marks_of_camera and not marks_of_camera[0].marker
     ]
     if nameless and len({name for pair in pairs for name in pair}) == 2:
-        return _name_two(named_marks, nameless, cameras, settings)
+        return _name_two(named_marks, nameless, cameras, pairs, settings)
     for camera in nameless:
         named_marks[camera], remarks = name_three(
             camera, marks[camera], cameras[camera], pairs, settings
@@ -198,12 +198,15 @@ def _name_two(
     marks: dict[str, Marks],
     nameless: Sequence[str],
     cameras: Mapping[str, Camera],
+    pairs: Mapping[tuple[str, str], float],
     settings: WandSettings,
 ) -> tuple[dict[str, Marks], list[str]]:
-    """Names A and B of two markers that look alike, the same in all cameras of a frame.
+    """The names of the known length for two markers that look alike, the same in all cameras of a
+    frame.
 
-    Which end of the wand is A means nothing; that it is the same end in all cameras does."""
-    # "A", "B" of named cameras in alphabetical order: they come first and decide
+    Which end of the wand has which name means nothing; that it is the same end in all cameras
+    does."""
+    # Markers of named cameras in alphabetical order, like `names`: they come first and decide.
     frames = {
         camera: {
             frame: sorted(marks_of_frame, key=lambda mark: mark.marker)
@@ -212,10 +215,7 @@ def _name_two(
         }
         for camera, marks_of_camera in marks.items()
     }
-    names_given = {
-        mark.marker for marks_of_camera in marks.values() for mark in marks_of_camera
-    } - {""}
-    names = sorted(names_given) if len(names_given) == 2 else ["A", "B"]
+    names = sorted({name for pair in pairs for name in pair})
     rays = {
         camera: {
             frame: ideal_features(cameras[camera], np.array([(m.x, m.y) for m in marks_of_frame]))
