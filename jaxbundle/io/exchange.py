@@ -65,6 +65,9 @@ class Converted:
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
+HOLDS_ALL = "--camera {}: {} holds all cameras; omit it"
+
+
 def describe_lost(lost: Sequence[str]) -> list[str]:
     """The line about what is not kept; none if nothing is lost."""
     return [f"not kept: {'; '.join(lost)}"] if lost else []
@@ -114,8 +117,13 @@ def convert(  # noqa: PLR0913, as the options of the command
         # Real paths: one of them may be a link.
         _refuse_overlap({os.path.realpath(input)}, {os.path.realpath(output)}, output)
         _protect_existing(output, kind, force)
+        of_networks = {"--set": overrides, "--control": control, "--measured": measured}
+        for option in (option for option, value in of_networks.items() if value):
+            raise InputError(f"{option}: is for networks, {input} has cameras alone; omit it")
         cameras = _add_sizes(read_cameras(input, models), image_size, pixel_size)
         if kind in TARGETS and TARGETS[kind].alone:
+            if camera is not None:
+                raise InputError(HOLDS_ALL.format(camera, kind))
             network = network_of_cameras(cameras, str(input)).warn(*fit_messages(cameras))
             return _convert_network(network, output, kind, model, measured, force, (), tell)
         converted = _convert_cameras(input, cameras, output, kind, model, camera, tell)
@@ -151,7 +159,7 @@ def convert(  # noqa: PLR0913, as the options of the command
             notes=network.notes,
         )
     if camera is not None:
-        raise InputError(f"--camera {camera}: {kind} holds all cameras; omit it")
+        raise InputError(HOLDS_ALL.format(camera, kind))
     return _convert_network(network, output, kind, model, measured, force, unread, tell)
 
 

@@ -176,6 +176,18 @@ def test_refused_and_nothing_written(brown, tmp_path, name):
     assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")} == before
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("camera", "cam"), ("overrides", ["a=1"]), ("control", "c.csv"), ("measured", True)],
+)
+def test_what_a_file_of_cameras_cannot_have_is_refused(tmp_path, option, value):
+    given = tmp_path / "cam.toml"
+    given.write_text('[[camera]]\nid = "cam"\nmodel = "opencv"\nfx = 800.0\nfy = 800.0\n')
+    with pytest.raises(InputError, match="omit it"):
+        convert(given, tmp_path / "transforms.json", **{option: value})
+    assert not (tmp_path / "transforms.json").exists()
+
+
 def test_on_the_command_line(brown, tmp_path, monkeypatch, capsys):
     arguments = ["convert", brown, tmp_path / "sparse", "--model", "opencv", "--measured"]
     monkeypatch.setattr(sys, "argv", ["jaxbundle", *map(os.fspath, arguments)])

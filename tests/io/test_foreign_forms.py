@@ -143,6 +143,8 @@ def test_region_and_binning_of_ros(tmp_path):
     assert camera.image_size == (200, 75) and (p["fx"], p["fy"]) == (250, 501 / 4)
     assert (p["cx"], p["cy"]) == ((320.5 - 100) / 2, (241.25 - 50) / 4) and p["k1"] == -0.3
     assert "roi and binning are applied" in fit_messages([camera])[0]
+    camera = read_one(tmp_path, {"K": K, "D": D, "binning_x": 2})
+    assert camera.image_size is None and "binning are applied" in fit_messages([camera])[0]
     (tmp_path / "info.yaml").write_text(OPENCV.replace("@", "") + "binning_x: 0\nroi: {width: 0}\n")
     (whole,) = read_cameras(tmp_path / "info.yaml")
     assert whole.image_size == (640, 480) and whole.parameters["cx"] == 320.5
@@ -297,6 +299,9 @@ def test_orb_slam(tmp_path):
     path.write_text(text.replace("KannalaBrandt8", "Spline"))
     with pytest.raises(InputError, match="Camera.type is Spline, of ORB-SLAM"):
         read_network(path)
+    path.write_text("settings:\n  Camera.fx: 458.654\n")
+    with pytest.raises(InputError, match="Camera.fx is missing at the first level"):
+        read_cameras(path)
     # before rectification: other cameras, whose images are not those of Camera.fx
     path = write_sample(tmp_path, "orb-slam")
     raw = "".join(f"{side}.K: {sum(K, [])}\n{side}.D:{D}\n" for side in ("LEFT", "RIGHT"))
@@ -380,6 +385,10 @@ def test_alicevision(tmp_path):
     assert_allclose(R, np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]).T, atol=1e-12)
     assert_allclose(net.images.position, [[1, 2, 3]], atol=1e-12)
     assert_allclose(net.observations.xy, [[2100, 1400]])
+    other = scene()
+    other["views"].append(other["views"][-1] | {"viewId": "99", "intrinsicId": "98"})
+    path.write_text(json.dumps(other))
+    assert any("1 view whose intrinsicId is not among" in w for w in read_network(path).warnings)
     old = scene(version=["1", "2", "0"], pxFocalLength=["3200", "3210"],
                 principalPoint=["2012.5", "1493"])  # fmt: skip
     path.write_text(json.dumps(old))

@@ -65,5 +65,6 @@ def _words(text: str) -> list[Any]:
 
 def _number(word: str) -> float | int:
     digits = word.lstrip("+-")
+    # Whole numbers of up to 15 digits are below 2⁵³, where floats hold every one.
     is_integer = digits.isascii() and digits.isdigit() and len(digits) < 16
     return int(word) if is_integer else float(word.replace(".Nan", "nan").replace(".Inf", "inf"))

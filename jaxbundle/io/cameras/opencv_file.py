@@ -251,7 +251,7 @@ def _pinhole_parameters(
             )
     core: dict[str, float] = dict(zip(CORE, map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))))
     for key in CORE:
-        # Programs that write both round one of them.
+        # Programs that write both round one of them: three decimals are off by up to 5e-4.
         if key in entries and abs(_number(path, entries, key) - core[key]) > 1e-3:
             raise InputError(
                 f"{path}: {entries[key][0]} is {entries[key][1]:g}, but {name} has {core[key]:g}; "
@@ -413,9 +413,10 @@ def _published_image(
         if (x, y, *region, *bins) == (0, 0, *size, 1, 1):
             return core, size, messages
         size = region[0] // bins[0], region[1] // bins[1]
+    if size is not None or bins != [1, 1]:
+        sides = "" if size is None else f", {size[0]} × {size[1]} px"
         messages = [
-            f"{path}: roi and binning are applied: the camera is that of the published image, "
-            f"{size[0]} × {size[1]} px"
+            f"{path}: roi and binning are applied: the camera is that of the published image{sides}"
         ]
     core = {
         "fx": core["fx"] / bins[0],

@@ -267,6 +267,8 @@ def orb_cameras(path: Path, fields: JsonFields, unknown: UnknownKeys) -> list[Ca
         )
     model, names = ORB_SLAM[kind]
     prefixes = [p for p in (*PREFIXES, "Camera2") if f"{p}.fx" in document]
+    if not prefixes:  # within another object
+        raise InputError(f"{path}: Camera.fx is missing at the first level; it is expected there")
     if "Camera" in prefixes and "Camera1" in prefixes:
         raise InputError(f"{path}: Camera.fx and Camera1.fx; expected one of them")
     camera_keys = [f"{p}.{name}" for p in prefixes for name in f"{CORE} {names}".split()]
