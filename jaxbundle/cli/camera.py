@@ -30,11 +30,11 @@ def camera(
     """Print field of view, 35 mm equivalent, and distortion by radius."""
     import jaxbundle
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
-    from jaxbundle.cli.outputs import check_json_target, put_json
+    from jaxbundle.cli.outputs import check_tables, put_json
     from jaxbundle.commands.cameras import CameraDescription
     from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
-    check_json_target(json, (file.partition("#")[0] for file in files))
+    check_tables([file.partition("#")[0] for file in files], json, csv=csv, plot=plot)
     smooth = 200  # points of a curve that looks smooth
     sizes = {
         "image_size": pair("--image-size", image_size),

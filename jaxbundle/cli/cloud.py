@@ -67,7 +67,7 @@ def cloud(  # noqa: PLR0913 - the options of the command
         plane=plane,
     )
     if dsm is not None and result.dsm is not None:
-        write_dsm(result.dsm, dsm, dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}"))
+        write_dsm(result.dsm, dsm, _beside(dsm))
     if out is not None:
         write_cloud(result.cloud, out)
     print_result(result, json, accept=accept)
@@ -83,6 +83,11 @@ CONTENT = {
 TIFF = re.compile(rb"II[*+]\0|MM\0[*+]")
 
 
+def _beside(dsm: Path) -> Path:
+    """The file of the σ of a DSM."""
+    return dsm.with_name(f"{dsm.stem}_sigma{dsm.suffix}")
+
+
 def _check_targets(inputs: Sequence[Path], out: Path | None, dsm: Path | None, force: bool) -> None:
     """Refuse a cloud of another format, and files that would replace an input, or something else
     than a cloud or a DSM."""
@@ -91,6 +96,8 @@ def _check_targets(inputs: Sequence[Path], out: Path | None, dsm: Path | None, f
     if out is not None and out.suffix.lower() not in CLOUD_FILES:
         raise InputError(f"--out {out}: expected one of {', '.join(CLOUD_FILES)}")
     targets = [("--dsm", dsm, TIFF, "a TIFF")]
+    if dsm is not None:
+        targets.append(("--dsm, σ in", _beside(dsm), TIFF, "a TIFF"))
     if out is not None:
         targets.append(("--out", out, CONTENT[out.suffix.lower()], "a cloud"))
     for option, path, content, noun in targets:

@@ -40,12 +40,12 @@ def compare(  # noqa: PLR0913 - the options of the command
     import jaxbundle
     from jaxbundle.cli.acceptance import check_accept
     from jaxbundle.cli.camera_inputs import calibration_given, pair, write_png
-    from jaxbundle.cli.outputs import check_json_target, print_result
+    from jaxbundle.cli.outputs import check_tables, print_result
     from jaxbundle.commands.comparison import CalibrationComparison, is_saved_adjustment
     from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
     check_accept(accept, "compare")
-    check_json_target(json, (source.partition("#")[0] for source in (a, b)))
+    check_tables([source.partition("#")[0] for source in (a, b)], json, csv=csv, plot=plot)
     if is_saved_adjustment(a) or is_saved_adjustment(b):
         if plot is not None:
             raise InputError("--plot: of calibrations only; --csv writes the table")

@@ -1,5 +1,6 @@
 """The options `--gis FILE --crs EPSG:NUMBER` of `adjust` and `reconstruct`."""
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,6 +28,8 @@ Crs = Annotated[
     ),
 ]
 SUFFIXES = (".gpkg", ".geojson", ".json")
+# The beginning of a GeoPackage, a database of SQLite.
+SQLITE = re.compile(rb"SQLite format 3")
 
 
 def check_gis(
@@ -40,7 +43,7 @@ def check_gis(
     the photographs or their control.
 
     **Raises:** `InputError`."""
-    from jaxbundle.cli.outputs import FORCE_ADVICE, check_file, check_json
+    from jaxbundle.cli.outputs import FORCE_ADVICE, JSON, check_content, check_file
     from jaxbundle.io.results.gis import check_crs, require_transformation
 
     if not gis:
@@ -55,12 +58,9 @@ def check_gis(
     if suffix != ".gpkg":
         if crs or not system_may_follow:
             require_transformation(crs)
-        check_json(gis, FORCE_ADVICE, "--gis")
-    elif Path(gis).is_file() and not force:
-        with Path(gis).open("rb") as file:
-            head = file.read(16)
-        if head and not head.startswith(b"SQLite format 3"):
-            raise InputError(f"--gis {gis}: exists and is no GeoPackage; give another name")
+    if not force:
+        content, noun = (SQLITE, "a GeoPackage") if suffix == ".gpkg" else (JSON, "JSON")
+        check_content("--gis", gis, content, noun, FORCE_ADVICE)
 
 
 def write_gis(result: "Adjustment", gis: str, crs: str) -> None:

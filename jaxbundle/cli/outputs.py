@@ -188,6 +188,14 @@ def check_json_target(json: str, inputs: Iterable[str | Path]) -> None:
     check_json(json)
 
 
+def check_tables(inputs: Sequence[str | Path], json: str, **files: Path | None) -> None:
+    """Refuse the file of --json, and others by the names of their options, that cannot be written
+    or would replace an input."""
+    check_json_target(json, inputs)
+    for option, file in files.items():
+        check_file(f"--{option.replace('_', '-')}", str(file or ""), None, inputs)
+
+
 def print_result(
     result: ReportedResult, json: str, quiet: bool = False, accept: Sequence[str] | None = None
 ) -> None:

@@ -93,7 +93,7 @@ def surface(  # noqa: PLR0913 - the options of the command
     """Match oriented images to a cloud with the σ of every point, and report its accuracy."""
     import jaxbundle
     from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
-    from jaxbundle.cli.outputs import check_json, put_json
+    from jaxbundle.cli.outputs import check_file, check_json, put_json
     from jaxbundle.cli.progress import staging
     from jaxbundle.io.results.result_json import json_text
     from jaxbundle.io.text.csv_tables import write_text
@@ -107,8 +107,11 @@ def surface(  # noqa: PLR0913 - the options of the command
     from jaxbundle.system.clock import in_words, now
 
     check_accept(accept, "surface")
-    check_json(json)
     check_folder(out, "surface", FILES, input, force)
+    given = (file for source in input for file in input_files(source))
+    beside = (file for file in (check, geoid) if file is not None)
+    check_file("--json", json, out, [*given, *beside])
+    check_json(json)
     with staging(quiet or json == "-") as show:
         result = jaxbundle.surface(
             input,

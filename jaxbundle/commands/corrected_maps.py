@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -136,7 +136,11 @@ def correct(  # noqa: PLR0913 (public: the options of the command, all but three
         raise InputError("--error: these are σ for --sigma; give its file")
     picture = _raster_of(scanner, image)
     targets = {"--out": out, "--error-map": error_map, "--sigma": sigma, "--checkpoint": checkpoint}
-    _check_targets({key: Path(path) for key, path in targets.items() if path is not None}, picture)
+    _check_targets(
+        {key: Path(path) for key, path in targets.items() if path is not None},
+        picture,
+        _input_files(scanner, dem, geoid, truth),
+    )
     # An ellipsoid hides nothing of itself where an image looks down.
     if occlusion and dem is None:
         raise InputError("--occlusion: needs terrain; give --dem")
@@ -268,16 +272,21 @@ def _fingerprint(
 ) -> str:
     """What the blocks of a map depend on, by names, sizes and times of the files: reading an image
     of gigabytes again takes as long as correcting a part of it."""
-    files = [*files_read(scanner), picture]
-    for source in (dem, geoid):
-        if source is not None and os.path.exists(source):
-            folder = Path(source)
-            files += sorted(folder.iterdir()) if folder.is_dir() else [folder]
     words = [repr(grid), str(crs), str(geoid), jaxbundle.__version__]
-    for path in files:
+    for path in [picture, *_input_files(scanner, dem, geoid)]:
         state = os.stat(path)
         words.append(f"{os.path.realpath(path)} {state.st_size} {state.st_mtime_ns}")
     return of_words(words)
+
+
+def _input_files(scanner: str | Path, *sources: str | Path | None) -> list[Path]:
+    """The files of the scanner, and of sources, those of folders among them."""
+    files = files_read(scanner)
+    for source in sources:
+        if source is not None and os.path.exists(source):
+            folder = Path(source)
+            files += sorted(folder.iterdir()) if folder.is_dir() else [folder]
+    return files
 
 
 def _raster_of(scanner: str | Path, image: str | Path | None) -> Path:
@@ -289,8 +298,9 @@ def _raster_of(scanner: str | Path, image: str | Path | None) -> Path:
     return Path(scanner)
 
 
-def _check_targets(targets: Mapping[str, Path], image: Path) -> None:
-    """Refuse outputs that cannot be written, before computing."""
+def _check_targets(targets: Mapping[str, Path], image: Path, inputs: Sequence[Path]) -> None:
+    """Refuse outputs that cannot be written, or would replace an input, before computing."""
+    real_inputs = {os.path.realpath(file) for file in inputs}
     option_of: dict[Path, str] = {}
     for option, path in targets.items():
         if not path.absolute().parent.is_dir():
@@ -301,6 +311,10 @@ def _check_targets(targets: Mapping[str, Path], image: Path) -> None:
             )
         if path.exists() and path.samefile(image):
             raise InputError(f"{option} {path} is the image itself; give another name")
+        if os.path.realpath(path) in real_inputs:
+            raise InputError(
+                f"{option} {path}: is part of the input and would be overwritten; give another"
+            )
         earlier_option = option_of.setdefault(Path(os.path.realpath(path)), option)
         if earlier_option != option:
             raise InputError(f"{option} {path} is also {earlier_option}; give another name")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,26 @@ def test_only_json_gives_way_to_json(network, tmp_path, text):
     assert target.read_text() == text
     with pytest.raises(InputError, match=f"{said}$"):
         keep_inputs([], csv=target, json=str(target))  # of the commands without --force
+
+
+def test_tables_and_figures_are_checked_before_the_work(command, tmp_path):
+    """A camera, a cloud, a geoid given as their own output stay as they are."""
+    camera, cloud, sigma = (tmp_path / name for name in ("cam.toml", "c.csv", "d_sigma.tif"))
+    camera.write_text('[[camera]]\nid = "cam"\nmodel = "brown"\nc = 20.0\n')
+    cloud.write_text("X,Y,Z\n0,0,0\n")
+    sigma.write_text("notes")
+    for arguments, why in (
+        (["camera", camera, "--csv", camera], "--csv .*part of the input"),
+        (["compare", camera, camera, "--plot", camera], "--plot .*part of the input"),
+        (["camera", camera, "--plot", tmp_path / "no" / "a.png"], "there is no folder"),
+        (["cloud", cloud, "--dsm", tmp_path / "d.tif", "--size", 1], "d_sigma.tif: exists and is"),
+    ):
+        before = [file.read_text() for file in (camera, cloud, sigma)]
+        told = command(*arguments)
+        assert told.status == 2 and re.search(why, told.err), told.err
+        assert [file.read_text() for file in (camera, cloud, sigma)] == before
+    with pytest.raises(InputError, match="--csv .*there is no folder"):
+        keep_inputs([], csv=tmp_path / "no" / "a.csv")
 
 
 @pytest.mark.parametrize("text", ["", "{}", ' {\n "a": 1}', "[]", "[\n[-1", '[{"a', "[ null]"])

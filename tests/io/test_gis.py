@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.cli.gis_output import check_gis
 from jaxbundle.errors import InputError
 from jaxbundle.io import write_geojson, write_geopackage
 
@@ -156,8 +157,14 @@ def test_the_command_writes_it_and_refuses_before_the_work(command, tmp_path):
         (["--gis", tmp_path / "n.geojson"], "longitude and latitude"),
         (["--gis", tmp_path / "n.gpkg", "--crs", "utm"], "EPSG:NUMBER"),
         (["--crs", "EPSG:25832"], "it is for --gis"),
-        (["--gis", tmp_path / "x.gpkg"], "no GeoPackage"),
+        (["--gis", tmp_path / "x.gpkg"], "is not a GeoPackage; give another name, or --force"),
         (["--gis", tmp_path / "no" / "n.gpkg"], "there is no folder"),
     ):
         told = command("adjust", project, *options)
         assert told.status == 2 and why in told.err and told.err.count("\n") == 1, told.err
+    pytest.importorskip("pyproj")
+    for name in ("x.gpkg", "x.geojson"):
+        (tmp_path / name).write_text("notes")
+        with pytest.raises(InputError, match="or --force to replace it"):
+            check_gis(str(tmp_path / name), "EPSG:25832", [])
+        check_gis(str(tmp_path / name), "EPSG:25832", [], force=True)

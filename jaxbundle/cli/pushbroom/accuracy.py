@@ -81,7 +81,7 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
     check_accept(accept, "pushbroom accuracy")
-    keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
+    keep_inputs([scanner, truth, dem, geoid], csv=csv, json=json, map=map_)
     if map_ is not None:
         _check_map(map_, table)
     if table:

@@ -84,7 +84,7 @@ def correct(  # noqa: PLR0913 - the options of the command
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn
 
     outputs = {"out": out, "error_map": error_map, "sigma": sigma, "checkpoint": checkpoint}
-    keep_inputs([scanner, image, dem, truth], **outputs)
+    keep_inputs([scanner, image, dem, geoid, truth], **outputs)
     errors = _errors(error or [])
     if checkpoint is not None:
         advise(f"run the same command again to resume; finished blocks are kept in {checkpoint}")

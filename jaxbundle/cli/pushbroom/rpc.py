@@ -73,7 +73,7 @@ def apply(
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
 
-    keep_inputs([coefficients, points, dem], csv=csv, json=json)
+    keep_inputs([coefficients, points, dem, geoid], csv=csv, json=json)
     applied = line_scanners.rpc.apply(
         coefficients, points, height=height, dem=dem, geoid=geoid, tell=warn
     )
@@ -115,7 +115,7 @@ def compensate(  # noqa: PLR0913 - the options of the command
 
     check_accept(accept, "pushbroom rpc compensate")
     # The tags of a raster may be replaced in place.
-    keep_inputs([control], out=out, csv=csv, json=json)
+    keep_inputs([control, geoid], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     compensated = line_scanners.rpc.compensate(
         coefficients,

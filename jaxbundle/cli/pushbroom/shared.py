@@ -1,7 +1,6 @@
 """Shared by the line scanner commands: surfaces, scanner files, tables."""
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,12 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 
-from jaxbundle.cli.outputs import check_json
+from jaxbundle.cli.outputs import check_file, check_json
 from jaxbundle.commands.scanner_inputs import check_spheroid as check_spheroid
 from jaxbundle.commands.scanner_inputs import geographic as geographic
 from jaxbundle.commands.scanner_inputs import open_scanner as read_scanner_file
 from jaxbundle.commands.scanner_inputs import surface_of as surface_of
-from jaxbundle.errors import InputError
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import write_csv, write_text
@@ -32,14 +30,11 @@ def open_scanner(path: Path) -> ScannerInput:
 
 
 def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
-    """Refuse an output file, by option name, that is an input; for JSON, `check_json`."""
-    input_files = {os.path.realpath(file) for path in inputs if path for file in files_read(path)}
+    """Refuse an output file, by option name, that cannot be written or is an input; for JSON,
+    `check_json`."""
+    input_files = [file for path in inputs if path for file in files_read(path)]
     for option, path in outputs.items():
-        if path and os.path.realpath(path) in input_files:
-            raise InputError(
-                f"--{option.replace('_', '-')} {path} is part of the input and would be "
-                "overwritten; give another"
-            )
+        check_file(f"--{option.replace('_', '-')}", str(path or ""), None, input_files)
     check_json(str(outputs.get("json") or ""))
 
 

@@ -161,13 +161,16 @@ def collect_features(result: "Adjustment", factor: float | None = None) -> Itera
     **Raises:** `InputError` for a factor that is not positive; `NotSolvedError`."""
     points, images = result.points, result.images
     C = result.point_covariance
+    variances = np.diagonal(C, axis1=1, axis2=2)
     if (modelled := result.correlated_point_covariance) is not None:
+        # σ as in the report, of every coordinate the larger; an ellipse is of one covariance.
+        variances = np.fmax(variances, np.diagonal(modelled, axis1=1, axis2=2))
         size = lambda C: np.trace(C, axis1=1, axis2=2)[:, None, None]
         C = np.where(size(modelled) > size(C), modelled, C)
     coordinates = result.point_values
     has_coordinates = np.asarray(np.isfinite(coordinates).all(1))
     for row in np.flatnonzero(has_coordinates):
-        sigma = np.sqrt(np.clip(np.diagonal(C[row]), 0, None))
+        sigma = np.sqrt(np.clip(variances[row], 0, None))
         yield Feature(
             "points",
             coordinates[row],
