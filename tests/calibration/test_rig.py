@@ -1,5 +1,6 @@
 """Cameras on one mounting: truth, Monte Carlo, OpenCV, photographs that do not belong together."""
 
+import copy
 import dataclasses
 from functools import partial
 from types import SimpleNamespace
@@ -31,7 +32,7 @@ from jaxbundle.geometry import (
 from jaxbundle.io.exchange import convert
 from jaxbundle.io.formats import read_network
 from jaxbundle.leastsquares import Pose, PoseValue
-from jaxbundle.network.tables import Camera
+from jaxbundle.network.tables import STATED, UNIT, Camera
 
 NOISE = 0.05
 RIGHT = render.Lens.of(fx=600.0, fy=602.0, cx=236.0, cy=181.0, k1=-0.1, k2=0.03, p1=-2e-4, p2=1e-4)
@@ -131,7 +132,9 @@ def test_a_rig_leaves_the_program(both, rig, tmp_path):
 @pytest.mark.further
 def test_the_views_of_a_rig_are_a_network_with_the_same_minimum(rig):
     """Exact mountings are conditions with a thousandth of the σ of a ray there."""
-    result = jaxbundle.adjust(network_of_views(rig))
+    network = network_of_views(rig)
+    assert network.observations.sigma_origin == UNIT
+    result = jaxbundle.adjust(network)
     np.testing.assert_allclose(result.sigma0, rig.sigma0, rtol=1e-3)
     for name in rig.names:
         found, sigma = result.camera_parameters(name), rig.sigma[name]
@@ -139,6 +142,15 @@ def test_the_views_of_a_rig_are_a_network_with_the_same_minimum(rig):
         assert np.abs(away).max() < 0.01
     halves = jaxbundle.replicate(result, by="points", repeat=2)
     assert not halves.failed and halves.dof == sum(map(len, rig.sigma.values()))
+    stated = copy.copy(rig)
+    stated.cameras = {
+        name: SimpleNamespace(
+            adjustment=SimpleNamespace(sigma_origin=STATED, network=calibration.adjustment.network),
+            camera=calibration.camera,
+        )
+        for name, calibration in rig.cameras.items()
+    }
+    assert network_of_views(stated).observations.sigma_origin == STATED
     known = rig.rig.known._replace(bases=[SimpleNamespace()])
     other = SimpleNamespace(rig=dataclasses.replace(rig.rig, known=known))
     assert network_of_views(other) is None

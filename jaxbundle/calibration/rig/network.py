@@ -14,7 +14,7 @@ import numpy as np
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.geometry.rotations import omega_phi_kappa_from_matrix
 from jaxbundle.network.build import make_network
-from jaxbundle.network.tables import EXTERIOR, UNIT, Camera, Network
+from jaxbundle.network.tables import EXTERIOR, STATED, UNIT, Camera, Network
 from jaxbundle.types import not_none
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ def network_of_views(calibration: "RigCalibration") -> Network | None:
         }
     names = [calibration.names[k] for k, _ in views]
     epochs = [rig.epochs[e] for _, e in views]
+    origins = {camera.adjustment.sigma_origin for camera in calibration.cameras.values()}
     return make_network(
         [_camera(calibration, name) for name in calibration.names],
         {"id": ids, "camera": names, **dict(zip(EXTERIOR, np.hstack([position, angles]).T))},
@@ -66,7 +67,7 @@ def network_of_views(calibration: "RigCalibration") -> Network | None:
         residuals="measured",
         image_unit=calibration.image_unit,
         object_unit=calibration.object_unit,
-        sigma_origin=UNIT,
+        sigma_origin=STATED if origins == {STATED} else UNIT,
         name="rig",
         rigs={"rig": ["rig"] * len(ids), "epoch": epochs, "image": ids},
         rig={"reference": calibration.names[0]},
