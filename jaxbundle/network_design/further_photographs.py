@@ -106,7 +106,9 @@ def _best_place(
             best = value, end, steps, has_converged
     if best is None:
         raise NotSolvedError("design: no place for a further photograph satisfies the conditions")
-    return *best[1:], (position + origin, np.exp(aims))
+    # Infinite where it is not determined.
+    with np.errstate(over="ignore"):
+        return *best[1:], (position + origin, np.exp(aims))
 
 
 def _with_another(network: Network) -> tuple[Network, str]:

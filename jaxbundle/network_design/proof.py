@@ -66,6 +66,11 @@ def prove(problem: NetworkProblem, aim: Aim, draws: int = 200, seed: int = 0) ->
     **Raises:** `NotSolvedError` if no draw can be adjusted."""
     draws = integer("draws", draws, least=2, most=100_000)
     truth, exact = problem.data.start, problem.data
+    # Redundancy numbers do not show in deviations: a reliability is proved by a mean σ of the same
+    # network, of its points, or of its projection centres if all points are held.
+    if aim.measure == "reliability":
+        has_points = points_of_interest(problem).any()
+        aim = Aim("mean") if has_points else Aim("mean", lambda values: values["image"].position)
     functions = functions_of(problem, aim)
     interest = np.flatnonzero(points_of_interest(problem))
     points = lambda values: np.asarray(coordinates(values))[interest]
@@ -80,12 +85,9 @@ def prove(problem: NetworkProblem, aim: Aim, draws: int = 200, seed: int = 0) ->
     if not errors:
         raise NotSolvedError("design: none of the simulated networks could be adjusted")
     d = np.array(errors)
-    # Redundancy numbers do not show in deviations: a reliability is proved by the mean σ of the
-    # same network.
-    shape = aim if aim.measure != "reliability" else Aim("mean")
     # About zero, not about their mean: a bias of the adjustment is a deviation too.
     blocks = np.einsum("nki,nkj->kij", d, d) / len(d)
-    return Proof(aim_of(problem, shape), measure(shape, blocks), draws, draws - len(d))
+    return Proof(aim_of(problem, aim), measure(aim, blocks), draws, draws - len(d))
 
 
 def _measure(exact: Data, random: np.random.Generator) -> Data:

@@ -164,7 +164,7 @@ class Design(TableMethods):
         if self.bound:
             yield (
                 f"no {self.after.photographs} photographs of these have an aim below "
-                f"{self.bound:.4g} ({100 * (self.after.aim / self.bound - 1):.2g} % less)"
+                f"{self.bound:.4g} ({100 * (1 - self.bound / self.after.aim):.0f} % less)"
             )
         if self.dropped:
             yield f"not needed: {list_some(self.dropped)}"

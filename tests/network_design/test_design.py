@@ -21,6 +21,8 @@ from jaxbundle.network_design.aims import Aim, measure, smallest_redundancy, tas
 from jaxbundle.network_design.feasible import start_at
 from jaxbundle.network_design.pairs import make_pairs
 from jaxbundle.network_design.priors import use_prior_tables
+from jaxbundle.network_design.proof import prove
+from jaxbundle.network_design.realise import problem_of
 from jaxbundle.network_design.search import configuration, make_program
 from jaxbundle.network_design.settings import DesignSettings
 from jaxbundle.network_design.variables import choose_variables, turn_axis
@@ -169,12 +171,22 @@ def test_a_row_of_stations_spreads_out(designed, site):
     assert length.min() > 1 and length.max() < 6
     assert (np.abs(rays.xy) < [12.05, 8.05]).all()
     assert "times smaller" in str(designed)
+    bounded = dataclasses.replace(designed, bound=designed.after.aim / 2)
+    assert "(50 % less)" in str(bounded)
 
 
 def test_simulated_networks_confirm_the_design(page, designed):
     proof = page["proof"]
     assert proof.failed == 0 and proof.agrees
     assert proof.predicted == pytest.approx(designed.after.aim, rel=1e-4)
+
+
+@pytest.mark.further
+def test_a_reliability_is_proved_without_points_that_are_free(plain):
+    """By the projection centres, whose σ the adjustment has, too."""
+    points = dataclasses.replace(plain.points, role=("fixed",) * len(plain.points))
+    problem = problem_of(plain.replace(points=points))
+    assert prove(problem, Aim("reliability"), 100).agrees
 
 
 @pytest.mark.further
