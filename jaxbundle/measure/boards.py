@@ -56,7 +56,7 @@ class Board:
     - `kind`: see the table.
     - `diameter`: of the circles, object unit: their images are then corrected for eccentricity.
     - `marker`, `dictionary`: side and OpenCV dictionary of the markers of `charuco`, or of the tags
-      of `aprilgrid`.
+      of `aprilgrid`; of tags the default stands for DICT_APRILTAG_36h11, Kalibr's.
     - `row_spacing`: distance of neighbouring rows (of tags for `aprilgrid`), if a print has
       stretched them: `square` is then that along the rows only.
     - `first_marker`: number of the first marker of `charuco` or `aprilgrid` in the dictionary, of
