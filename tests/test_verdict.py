@@ -18,7 +18,9 @@ from jaxbundle import Adjustment, Camera, grid_of_targets, ring_of_stations, sim
 from jaxbundle.io.results.result_json import result_dict, result_text
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test, describe_test
+from jaxbundle.network.blunders import Removed, removed_rays
 from jaxbundle.network.tables import ESTIMATED, STATED, UNIT, LeftOut
+from jaxbundle.report.head import count_removed
 from jaxbundle.report.page import compose
 from jaxbundle.report.verdict import (
     BAD,
@@ -194,6 +196,7 @@ def test_handheld_control_is_an_uncertain_georeference_and_no_weak_network():
     control = finding(result, "Control")
     assert control.state == NOTED and told in control.words
     assert "georeference uncertain to" in result.verdict.words
+
     # What is said of the images holds: ratios of distances, which no datum changes.
     def ratio(values):
         X0 = values["image"].position
@@ -263,3 +266,9 @@ def test_the_judgement_of_blunders_is_one():
     check = lambda ratio: judge_check_points(2, "RMS 1 m", np.array(ratio), 4.0)
     assert (check([3.9, 1.0]).state, check([4.1]).state) == (GOOD, DOUBTFUL)
     assert check([4.1]).brief == "a check point 4.10 σ off"
+    # Without a σ of any difference nothing is tested, and nothing is met.
+    for ratio in ([], [np.nan]):
+        assert (check(ratio).state, check(ratio).brief) == (DOUBTFUL, "check points not tested")
+    # Observations that cannot be told apart are two that are missing.
+    removed = (Removed("image", 3, "3", 5.0), Removed("image", 4, "4 or 5", 5.0, (5,)))
+    assert count_removed(removed) == len(removed_rays(removed)) == 3

@@ -12,7 +12,7 @@ from jaxbundle.batches.population import Population
 from jaxbundle.cameras import get_model
 from jaxbundle.certificates.criteria import Criterion, read_criteria, read_criterion
 from jaxbundle.certificates.lengths import LengthTest, length_errors, read_lengths
-from jaxbundle.certificates.quantities import find_quantity, offered
+from jaxbundle.certificates.quantities import find_quantity, named_unknown, offered
 from jaxbundle.certificates.quantities_of_batches import SOLVED
 from jaxbundle.certificates.quantities_of_others import unknown_quantity
 from jaxbundle.certificates.quantity import AXES, require_parameter
@@ -26,6 +26,7 @@ from jaxbundle.results import ReportedResult, TableMethods
 
 # Arguments that are names of unknowns; of other quantities they are words.
 OF_UNKNOWNS = ("sigma", "sigma.rms", "value", "t", "correlation")
+OF_CAMERAS = ("t", "correlation")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +62,8 @@ class AcceptanceRow:
         """The value with its unit; a dash without one."""
         if self.why:
             return MISSING
+        if math.isinf(self.value):
+            return str(self.value)
         whole = self.value == round(self.value) and abs(self.value) < 1e9
         value = f"{self.value:.0f}" if whole else significant(self.value, self.digits)
         return f"{value} {self.criterion.unit}".strip()
@@ -69,6 +72,7 @@ class AcceptanceRow:
     def digits(self) -> int:
         """Three digits, or as many as show on which side of the limit the value is."""
         limit = self.criterion.limit
+        # A decimal number of 15 digits survives as a double, one of 16 may not.
         for digits in range(3, 16):
             rounded = float(f"{self.value:.{digits - 1}e}")
             if self.criterion.holds(rounded) == self.criterion.holds(self.value) and (
@@ -183,7 +187,7 @@ def accept(
     return _accept(result, criteria, lengths, _judge)
 
 
-def accept_known(result: Any, criteria: Iterable[str]) -> Acceptance:
+def accept_known(result: Any, criteria: Iterable[str], lengths: Any = None) -> Acceptance:
     """`accept`, in which a criterion that is refused is not met, with the reason."""
 
     def judge(subject: Any, test: LengthTest | None, criterion: Criterion) -> AcceptanceRow:
@@ -193,7 +197,7 @@ def accept_known(result: Any, criteria: Iterable[str]) -> Acceptance:
             why = str(error).removeprefix(f"criterion {criterion.text!r}: ")
             return AcceptanceRow(criterion, math.nan, why=why)
 
-    return _accept(result, criteria, None, judge)
+    return _accept(result, criteria, lengths, judge)
 
 
 def _accept(
@@ -301,8 +305,11 @@ def _check_unknown(
     name = criterion.argument.rpartition(":")[2]
     if command == "calibrate-rig" and name in ("base", "rotation"):
         return
-    if name in (*EXTERIOR, *AXES) and command != "calibrate-rig":
-        return
+    # The arguments of rigs and batches are CAMERA:NAME, or the name of a column.
+    if command not in ("calibrate-rig", "batch"):
+        kind, _, name = named_unknown(criterion.argument, criterion.name in OF_CAMERAS)
+        if kind != "camera":
+            return
     if not cameras:
         return
     require_parameter(cameras, name)

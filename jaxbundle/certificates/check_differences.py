@@ -45,7 +45,8 @@ def check_point_quantities(
             raise LookupError("the result has no check points")
         is_known = np.asarray(np.isfinite(differences.difference).any(0))
         axes = [i for i, axis in enumerate(AXES) if axis in PARTS[argument] and is_known[i]]
-        if not axes:
+        # Without an argument it is that of all axes that are known.
+        if not axes or (argument and len(axes) < len(PARTS[argument])):
             raise LookupError("no check point has this difference")
         return differences, axes
 

@@ -31,7 +31,7 @@ from typing import Any
 from jaxbundle.adjustment.budget_inputs import DIVISORS, HeldInput
 from jaxbundle.adjustment.quality.fixed_quantities import split_name
 from jaxbundle.arguments import number, positive, show
-from jaxbundle.certificates.lengths import RULES
+from jaxbundle.certificates.lengths import RULES, read_mpe
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.network.columns import refuse_unknown
@@ -172,6 +172,11 @@ def _evaluation(section: Mapping[str, Any], where: str) -> dict[str, Any]:
     for name in ("mpe", "rule"):
         if name in section:
             options[name] = str(section[name])
+    if "mpe" in section:
+        try:
+            read_mpe(options["mpe"], "m")
+        except InputError as error:
+            raise InputError(f"{where}, mpe: {error}") from None
     for name in ("horizontal_class", "vertical_class"):
         if name in section:
             options[name] = positive(f"{where}, {name}", section[name])
@@ -212,6 +217,8 @@ def _input(entry: Mapping[str, Any], place: str) -> HeldInput:
     if distribution not in DIVISORS:
         raise InputError(f"{place}, distribution: expected one of {', '.join(DIVISORS)}")
     value = positive(f"{place}, {forms[0]}", entry[forms[0]])
+    if "k" in entry and forms[0] != "expanded":
+        raise InputError(f"{place}: k is the coverage factor of expanded; omit it with {forms[0]}")
     if forms[0] == "limits":
         value /= DIVISORS[distribution]
     if forms[0] == "expanded":

@@ -1,6 +1,7 @@
 """The certificate of a result."""
 
 import dataclasses
+import math
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.calibration.several import Calibrations
 from jaxbundle.certificates.acceptance import Acceptance, accept, length_test_of
 from jaxbundle.certificates.details import NO_DETAILS, CertificateDetails, read_details
-from jaxbundle.certificates.lengths import LengthTest
+from jaxbundle.certificates.lengths import LengthTest, read_mpe
 from jaxbundle.certificates.positional import PositionalAccuracy, positional_accuracy
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
@@ -28,8 +29,8 @@ from jaxbundle.results import ResultMethods
 class CertifiedPart:
     """One adjustment of a certificate: its `name` (empty for the only one), the `adjustment`, its
     `calibration` if it is of one camera, the `budget` of its quantities, None if nothing of it can
-    be a measurand, with the reason in `no_budget`; its `accuracy` at check points, None
-    without."""
+    be a measurand, with the reason in `no_budget`; its `accuracy` at check points, None without
+    any, or if it cannot be stated, with the reason in `no_accuracy`."""
 
     name: str
     adjustment: Adjustment
@@ -37,6 +38,7 @@ class CertifiedPart:
     budget: UncertaintyBudget | None = None
     no_budget: str = ""
     accuracy: PositionalAccuracy | None = None
+    no_accuracy: str = ""
 
 
 @print_in_one_screen
@@ -97,6 +99,7 @@ class Certificate(ResultMethods):
                     "positional_accuracy": None
                     if part.accuracy is None
                     else part.accuracy.to_dict(),
+                    "no_positional_accuracy": part.no_accuracy,
                 }
                 for part in self.parts
             ],
@@ -109,6 +112,7 @@ class Certificate(ResultMethods):
         for part in self.parts:
             lines += [part.name] * bool(part.name)
             lines += str(part.budget).splitlines() if part.budget is not None else [part.no_budget]
+            lines += [part.no_accuracy] * bool(part.no_accuracy)
             lines += [] if part.accuracy is None else str(part.accuracy).splitlines()
         lines += [] if self.lengths is None else str(self.lengths).splitlines()
         lines += [] if self.acceptance is None else str(self.acceptance).splitlines()
@@ -153,6 +157,8 @@ def certificate(
             rule=certificate_details.rule,
             volume=certificate_details.volume,
         )
+    elif test is not None:
+        _require_same(test, certificate_details)
     parts = tuple(
         _part(name, adjustment_of_part, certificate_details)
         for name, adjustment_of_part in adjustments.items()
@@ -161,6 +167,23 @@ def certificate(
     acceptance = accept(result, criteria, lengths=test) if criteria else None
     rig = result if isinstance(result, RigCalibration) else getattr(result, "rig", None)
     return Certificate(result, certificate_details, parts, rig, test, acceptance, origin)
+
+
+def _require_same(test: LengthTest, details: CertificateDetails) -> None:
+    """Refuse a test of lengths that was made otherwise than the details say.
+
+    **Raises:** `InputError`."""
+    stated = {
+        "mpe": bool(details.mpe) and test.mpe != read_mpe(details.mpe, test.unit),
+        "rule": details.rule not in (NO_DETAILS.rule, test.rule),
+        "volume": details.volume is not None
+        and not math.isclose(math.hypot(*details.volume), test.diagonal),
+    }
+    if differing := [name for name, differs in stated.items() if differs]:
+        raise InputError(
+            f"{', '.join(differing)} of the details are not those of the LengthTest: give the "
+            "table of calibrated lengths, or omit them"
+        )
 
 
 def _adjustments(result: Any) -> dict[str, Adjustment | Calibration]:
@@ -204,10 +227,14 @@ def _part(
             )
         except NotSolvedError as error:
             why = f"No budget: {error}."
-    accuracy = None
+    accuracy, no_accuracy = None, ""
     if adjustment.check_points is not None:
-        accuracy = positional_accuracy(adjustment, details.horizontal_class, details.vertical_class)
-    return CertifiedPart(name, adjustment, calibration, budget, why, accuracy)
+        classes = (details.horizontal_class, details.vertical_class)
+        try:
+            accuracy = positional_accuracy(adjustment, *classes)
+        except InputError as error:
+            no_accuracy = f"No positional accuracy: {error}."
+    return CertifiedPart(name, adjustment, calibration, budget, why, accuracy, no_accuracy)
 
 
 __all__ = ["NO_DETAILS", "Certificate", "CertifiedPart", "certificate"]

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.problem import coordinates
+from jaxbundle.adjustment.problem import coordinates, is_scale_open
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import at_least_zero, one_of, positive, show
 from jaxbundle.certificates.units import convert
@@ -230,19 +230,26 @@ class LengthTest(TableMethods):
 
     @property
     def converged(self) -> bool:
+        """Always: a test is made only of an adjustment with a solution."""
         return True
 
     def requirements(self) -> list[tuple[str, str, str, bool]]:
-        """What VDI/VDE 2634-1 wants of the arrangement: subject, wanted, found, whether it is
-        met; lines only where the table states them."""
-        per_line: dict[str, int] = {}
-        for line in self.lengths.line:
-            per_line[line] = per_line.get(line, 0) + 1
-        lines = {name: n for name, n in per_line.items() if name}
+        """What VDI/VDE 2634-1 wants of the arrangement, and ISO 10360-2 of repetitions: subject,
+        wanted, found, whether it is met; lines only where the table states them, repetitions only
+        where there are some."""
+        repetitions: dict[tuple[str, frozenset[str]], int] = {}
+        for line, ends in zip(self.lengths.line, self.lengths.ends):
+            length = line, frozenset(ends)
+            repetitions[length] = repetitions.get(length, 0) + 1
+        lines: dict[str, int] = {}
+        for line, _ in repetitions:
+            if line:
+                lines[line] = lines.get(line, 0) + 1
         reach = float(self.lengths.value.max()) / self.diagonal if self.diagonal > 0 else math.nan
         fewest = min(lines.values(), default=0)
         not_stated = "not stated (column line)"
-        return [
+        fewest_repetitions = min(repetitions.values())
+        found = [
             (
                 "measuring lines",
                 f"≥ {LEAST_LINES}",
@@ -262,6 +269,17 @@ class LengthTest(TableMethods):
                 reach >= LEAST_REACH,
             ),
         ]
+        # VDI/VDE 2634-1 wants none: a test without any is not one of ISO 10360-2.
+        if max(repetitions.values()) > 1:
+            found.append(
+                (
+                    "repetitions of a length (ISO 10360-2)",
+                    f"≥ {REPETITIONS}",
+                    str(fewest_repetitions),
+                    fewest_repetitions >= REPETITIONS,
+                )
+            )
+        return found
 
     def table(self) -> dict[str, np.ndarray]:
         """A row a length: from, to, line, calibrated, sigma_calibrated, measured, sigma_measured,
@@ -375,15 +393,18 @@ def length_errors(
         raise InputError(f"expected a result of jaxbundle.adjust, got {show(given)}")
     one_of("rule", rule, RULES)
     calibrated = read_lengths(lengths)
-    if adjustment.counts.datum == 7:  # noqa: PLR2004 - three shifts, three rotations, scale
+    problem = adjustment.problem
+    points, datum = problem.network.points, problem.plan.datum
+    about_origin = points.position - np.asarray(problem.origin)
+    if datum is not None and is_scale_open(np.asarray(datum.gauge), about_origin):
         raise InputError(
-            f"{calibrated.source}: the network has no scale: add a distance or control points"
+            f"{calibrated.source}: the network has no scale: add a distance or control points, at "
+            "least two"
         )
     unit = adjustment.network.object_unit
     limit = read_mpe(mpe, unit) if isinstance(mpe, str) else mpe
     known_points = _positions(adjustment)
     _refuse_observed(adjustment, calibrated)
-    points = adjustment.problem.network.points
     is_control = points.has_role("control", "fixed")
     control = {id for id, is_of_control in zip(points.id, is_control) if is_of_control}
     rows_measured = [

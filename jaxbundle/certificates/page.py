@@ -31,7 +31,7 @@ from jaxbundle.report.correlated import INDEPENDENCE
 from jaxbundle.report.layout import clean, column_decimals, fixed, significant
 from jaxbundle.report.page.charts import ChartLayout, Curve, draw_curves, draw_field, draw_plan
 from jaxbundle.report.page.document import Page, Section, write
-from jaxbundle.report.page.markup import facts, figure, grid, items, paragraph, text
+from jaxbundle.report.page.markup import facts, figure, grid, grid_of_first, items, paragraph, text
 from jaxbundle.report.page.sections import show_correlations
 from jaxbundle.report.verdict import BAD, GOOD
 
@@ -152,10 +152,13 @@ def _figures(part: "CertifiedPart") -> list[Card]:
     if part.accuracy is not None:
         accuracy = part.accuracy
         state = {"met": "good", "not met": "bad", "": ""}[accuracy.verdict]
-        rmse = accuracy.rmse_3d if all(accuracy.number) else accuracy.rmse_v
+        title, rmse = "RMSE_V", accuracy.rmse_v
+        if accuracy.number[0]:
+            title, rmse = "RMSE_H", accuracy.rmse_h
+        if all(accuracy.number):
+            title, rmse = "RMSE_3D", accuracy.rmse_3d
         value = readable_length(rmse, accuracy.unit)
         note = count(max(accuracy.number), "check point")
-        title = "RMSE_3D" if all(accuracy.number) else "RMSE_V"
         cards.append(Card(f"{name}{title}", value, note, state))
     if part.budget is not None:
         value, U, unit = part.budget.result_rows()[0][1:4]
@@ -220,6 +223,7 @@ def draw_network(adjustment: "Adjustment") -> str:
         x, y = centre[:, None] + factor * root @ circle
         lines.append(Curve(f"σ of a point × {factor:g}", x, y, kind="first"))
     size = 0.012 * extent
+    # An equilateral triangle, √3/2 = 0.87, closed by its first corner.
     corners = size * np.array([[0, 1], [-0.87, -0.5], [0.87, -0.5], [0, 1]])
     for station in stations:
         x, y = (station + corners).T
@@ -321,9 +325,9 @@ def _budgets(certificate: "Certificate") -> Iterator[Section]:
         if part.budget is None:
             continue
         for m, measurand in enumerate(part.budget.measurands):
-            if remaining == 0:
-                break
             remaining -= 1
+            if remaining < 0:
+                continue
             where = f", {part.name}" if part.name else ""
             row = part.budget.result_rows()[m]
             parts += [
@@ -337,6 +341,8 @@ def _budgets(certificate: "Certificate") -> Iterator[Section]:
             ]
     if not parts:
         return
+    if remaining < 0:
+        parts.append(paragraph(f"… and the budgets of {-remaining} more results."))
     parts.append(
         paragraph(
             "c: derivative of the result with respect to the input, through the whole adjustment; "
@@ -425,9 +431,9 @@ def _draw_errors(test: "LengthTest") -> str:
         if half_width > 0:
             upright = np.array([error - half_width, error + half_width])
             curves.append(Curve("± 2u of the calibration", np.full(2, length), upright))
-    if test.limit is not None:
+    if test.mpe is not None:
         lengths_drawn = np.linspace(0.0, float(x[-1]), 60)
-        limit = (test.mpe or (lambda _: lengths_drawn))(lengths_drawn)
+        limit = test.mpe(lengths_drawn)
         curves += [
             Curve("± MPE", lengths_drawn, sign * limit, kind="second") for sign in (1.0, -1.0)
         ]
@@ -438,18 +444,20 @@ def _draw_errors(test: "LengthTest") -> str:
 
 def _accuracy(certificate: "Certificate") -> Iterator[Section]:
     for part in certificate.parts:
-        if (accuracy := part.accuracy) is None:
+        if (accuracy := part.accuracy) is not None:
+            parts = [
+                grid(SUMMARY_HEADER, accuracy.summary()),
+                items(accuracy.statements()),
+                *([items(accuracy.remarks())] if accuracy.remarks() else []),
+                f"<h3>Check points: product − check point, in {text(accuracy.unit)}</h3>\n",
+                grid_of_first(positional.HEADER, accuracy.rows(), MOST_ROWS),
+                paragraph(f"Standard: {positional.STANDARD}."),
+            ]
+        elif part.no_accuracy:
+            parts = [paragraph(part.no_accuracy)]
+        else:
             continue
         where = f", {part.name}" if part.name else ""
-        rows = accuracy.rows()
-        parts = [
-            grid(SUMMARY_HEADER, accuracy.summary()),
-            items(accuracy.statements()),
-            *([items(accuracy.remarks())] if accuracy.remarks() else []),
-            f"<h3>Check points: product − check point, in {text(accuracy.unit)}</h3>\n",
-            grid(positional.HEADER, rows[:MOST_ROWS]),
-            paragraph(f"Standard: {positional.STANDARD}."),
-        ]
         link = "Positional accuracy" if part is certificate.parts[0] else ""
         title = f"Positional accuracy{where}"
         yield Section("accuracy" + part.name.replace(" ", "-"), title, "".join(parts), link)
@@ -478,7 +486,7 @@ def _control(adjustment: "Adjustment") -> Iterator[str]:
     unit = clean(adjustment.network.object_unit)
     if rows := control_rows(adjustment):
         yield f"<h3>Control points: adjusted − given, in {text(unit)}</h3>\n"
-        yield grid(CONTROL_HEADER, rows[:MOST_ROWS])
+        yield grid_of_first(CONTROL_HEADER, rows, MOST_ROWS)
     if number := int(adjustment.problem.network.points.has_role("fixed").sum()):
         yield paragraph(f"{count(number, 'point')} held at given coordinates, without σ.")
     points = adjustment.table("control")
@@ -486,7 +494,7 @@ def _control(adjustment: "Adjustment") -> Iterator[str]:
         predicted = observations.predicted_rows(points, ("id",), "XYZ")
         yield f"<h3>Control predicted from all other observations, in {text(unit)}</h3>\n"
         yield paragraph(observations.PREDICTION_LEGEND)
-        yield grid(observations.CONTROL_HEADER, predicted[:MOST_ROWS])
+        yield grid_of_first(observations.CONTROL_HEADER, predicted, MOST_ROWS)
 
 
 CONTROL_HEADER = ("point", "X", "Y", "Z", "vX", "vY", "vZ", "σX", "σY", "σZ")

@@ -37,6 +37,8 @@ STANDARD = (
 LEAST_POINTS = 30
 # The largest share of a mean error in the RMSE.
 MEAN_SHARE = 0.25
+# What a check point has that is one of a direction.
+KNOWN = {"horizontal": "X and Y", "vertical": "Z"}
 
 
 @print_in_one_screen
@@ -76,9 +78,9 @@ class PositionalAccuracy(TableMethods):
 
     @property
     def survey(self) -> tuple[float, float]:
-        """RMSE_H2 and RMSE_V2, of the survey of the check points; 0 where no σ is stated."""
-        is_known = np.isfinite(self.difference)
-        s = np.nan_to_num(_rms(np.where(is_known, np.nan_to_num(self.sigma), np.nan)))
+        """RMSE_H2 and RMSE_V2, of the survey of the check points whose σ is stated; 0 without
+        any."""
+        s = np.nan_to_num(_rms(np.where(np.isfinite(self.difference), self.sigma, np.nan)))
         return float(np.hypot(s[0], s[1])), float(s[2])
 
     @property
@@ -100,17 +102,21 @@ class PositionalAccuracy(TableMethods):
     @property
     def enough(self) -> bool:
         """Whether there are as many check points as the standard wants."""
-        return min(n for n in self.number if n) >= LEAST_POINTS
+        return min((n for n in self.number if n), default=0) >= LEAST_POINTS
 
     @property
     def verdict(self) -> str:
-        """ "met" or "not met" of the classes; empty without any."""
-        tested = [
-            (self.rmse_h, self.horizontal_class),
-            (self.rmse_v, self.vertical_class),
+        """ "met" or "not met" of the classes; empty without any, and where a class has no check
+        points, unless the other is not met."""
+        classes = (self.horizontal_class, self.vertical_class)
+        stated = [
+            (number, value <= limit)
+            for number, value, limit in zip(self.number, (self.rmse_h, self.rmse_v), classes)
+            if limit is not None
         ]
-        within_classes = [value <= limit for value, limit in tested if limit is not None]
-        return "" if not within_classes else "met" if all(within_classes) else "not met"
+        if any(number and not is_within for number, is_within in stated):
+            return "not met"
+        return "met" if stated and all(number for number, _ in stated) else ""
 
     def statements(self) -> list[str]:
         """The accuracy in the words of the standard."""
@@ -119,9 +125,14 @@ class PositionalAccuracy(TableMethods):
             ("horizontal", self.rmse_h, self.horizontal_class, self.number[0]),
             ("vertical", self.rmse_v, self.vertical_class, self.number[1]),
         ):
-            if not number:
-                continue
             symbol = "RMSE_H" if direction == "horizontal" else "RMSE_V"
+            if not number:
+                if limit is not None:
+                    sentences.append(
+                        f"The {direction} accuracy class of {self._centimetres(limit)} {symbol} is "
+                        f"not tested: no check point has {KNOWN[direction]}."
+                    )
+                continue
             tested = (
                 f"Tested {direction} positional accuracy: {symbol} = {self._centimetres(value)}"
             )
@@ -148,10 +159,20 @@ class PositionalAccuracy(TableMethods):
                     f"mean error in {axis} {significant(float(mean))} {self.unit}: more than a "
                     f"quarter of its RMSE {significant(float(rms))}; look for its cause"
                 )
-        for direction, survey, product in (
-            ("horizontal", self.survey[0], self.rmse_h),
-            ("vertical", self.survey[1], self.rmse_v),
+        is_known, is_stated = np.isfinite(self.difference), np.isfinite(self.sigma)
+        for direction, axes, survey, product in (
+            ("horizontal", [0, 1], self.survey[0], self.rmse_h),
+            ("vertical", [2], self.survey[1], self.rmse_v),
         ):
+            of_direction = is_known[:, axes].all(1)
+            number, stated = of_direction.sum(), (of_direction & is_stated[:, axes].all(1)).sum()
+            if not number:
+                continue
+            if 0 < stated < number:
+                sentences.append(
+                    f"the σ of the {direction} survey is stated of {stated} of {number} check "
+                    "points: taken as that of the others, too"
+                )
             if survey == 0:
                 sentences.append(
                     f"no σ of the {direction} survey of the check points is stated: taken as 0"

@@ -42,6 +42,7 @@ from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.reconstruction.result import Reconstruction
 from jaxbundle.refinement import Refinement
 from jaxbundle.report.correlated import stated_sigma, stated_sigma_of
+from jaxbundle.report.head import count_removed
 from jaxbundle.types import not_none
 
 
@@ -77,14 +78,14 @@ def find_quantity(
         if name in by_name:
             by_name[name].check_argument(argument)
             parts = {
-                label: by_name[name].find(Subject(quantity, lengths), argument)
-                for label, quantity in subjects.items()
+                label: by_name[name].find(Subject(part_result, lengths), argument)
+                for label, part_result in subjects.items()
             }
             return _join(parts)
     if not groups:
         return find_by_path(result, name, argument)
-    by_name = {quantity.form for quantities, _ in groups for quantity in quantities}
-    raise InputError(unknown_quantity(name, sorted(by_name)))
+    forms = {quantity.form for quantities, _ in groups for quantity in quantities}
+    raise InputError(unknown_quantity(name, sorted(forms)))
 
 
 def _parts_of(result: Any) -> list[tuple[tuple[Quantity, ...], dict[str, Any]]]:
@@ -145,9 +146,29 @@ def _pitch(cameras: Any) -> PixelPitch:
     return NO_PITCH
 
 
-def _split_argument(argument: str) -> tuple[str, str, str]:
+WITH_ARTICLE = {"image": "an image", "point": "a point"}
+
+
+def named_unknown(argument: str, of_cameras_alone: bool = False) -> tuple[str, str, str]:
     """KIND, ID and NAME of an argument: a parameter alone is that of all cameras, images or
-    points."""
+    points.
+
+    **Raises:** `InputError` for another form, and for a name that no image or point has, or that is
+    none of a camera where only cameras have the quantity."""
+    kind, id, name = _split_argument(argument)
+    if kind == "camera":
+        return kind, id, name
+    if of_cameras_alone:
+        raise InputError("only parameters of cameras have it, such as c")
+    known_names = EXTERIOR if kind == "image" else AXES
+    if name not in known_names:
+        raise InputError(
+            f"there is no {name!r} of {WITH_ARTICLE[kind]}; known: {', '.join(known_names)}"
+        )
+    return kind, id, name
+
+
+def _split_argument(argument: str) -> tuple[str, str, str]:
     kind, mark, after_kind = argument.partition(":")
     id, second_mark, name = after_kind.rpartition(":")
     if mark and second_mark and name and kind in ("camera", "image", "point"):
@@ -175,17 +196,12 @@ def _parameters(
 ) -> QuantityValues:
     """A number for each of the named unknowns that are estimated."""
     adjustment: Adjustment = subject.result
-    kind, id, name = _split_argument(argument)
+    kind, id, name = named_unknown(argument, of_table is None)
     network = adjustment.problem.network
     if kind == "camera":
         return _of_cameras(adjustment, id, name, of_camera, unit_less)
-    if of_table is None:
-        raise InputError("only parameters of cameras have it, such as c")
     rows = adjustment.images if kind == "image" else adjustment.points
-    if name not in (EXTERIOR if kind == "image" else AXES):
-        known_names = ", ".join(EXTERIOR if kind == "image" else AXES)
-        raise InputError(f"there is no {name!r} of an {kind}; known: {known_names}")
-    values, ids = of_table(rows, name), [str(x) for x in rows["id"]]
+    values, ids = not_none(of_table)(rows, name), [str(x) for x in rows["id"]]
     if id not in ("*", *ids):
         raise LookupError(f"there is no {kind} {id!r}")
     free = stated_sigma(rows, name) > 0
@@ -195,7 +211,7 @@ def _parameters(
         if is_free and id in ("*", k) and math.isfinite(v)
     }
     if not named_unknowns:
-        raise LookupError(f"no {name} of an {kind} is estimated")
+        raise LookupError(f"no {name} of {WITH_ARTICLE[kind]} is estimated")
     angle = name in EXTERIOR[3:]
     return QuantityValues(named_unknowns, network.angle_unit if angle else network.object_unit)
 
@@ -288,7 +304,10 @@ def _lengths(subject: Subject) -> LengthTest:
 
 def _lme(subject: Subject, _: str) -> QuantityValues:
     test = _lengths(subject)
-    errors = dict(zip(test.lengths.ends, np.abs(test.error).tolist()))
+    errors: dict[tuple[str, str], float] = {}
+    for ends, error in zip(test.lengths.ends, np.abs(test.error).tolist()):
+        # Of repetitions the largest: each of them has to meet the limit.
+        errors[ends] = max(error, errors.get(ends, 0.0))
     # A length that was not measured is not accepted.
     errors |= dict.fromkeys(test.missing, math.nan)
     return QuantityValues({f"length {a} – {b}": e for (a, b), e in errors.items()}, test.unit)
@@ -336,7 +355,7 @@ OF_ADJUSTMENT: tuple[Quantity, ...] = (
         "removed",
         "",
         "observations removed as blunders",
-        number_of_result(lambda a: len(a.removed)),
+        number_of_result(lambda a: count_removed(a.removed)),
     ),
     Quantity("warnings", "", "number of warnings", number_of_result(lambda a: len(a.warnings))),
     Quantity(

@@ -22,6 +22,7 @@ from jaxbundle.network.columns import did_you_mean, list_some
 from jaxbundle.network.kinds.robot_poses import PARTS
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.refinement import Refinement
+from jaxbundle.report.head import count_removed
 
 METRE = "m"
 
@@ -137,7 +138,7 @@ OF_REFINEMENT: tuple[Quantity, ...] = (
         "removed",
         "",
         "observations removed as blunders",
-        number_of_result(lambda r: len(r.removed)),
+        number_of_result(lambda r: count_removed(r.removed)),
     ),
     Quantity("warnings", "", "number of warnings", number_of_result(lambda r: len(r.warnings))),
     Quantity("sigma(X|Y|Z)", "length", "σ of the points, the largest", _point_sigma),

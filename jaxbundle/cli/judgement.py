@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbundle.certificates.acceptance import (
     Acceptance,
-    accept,
+    accept_known,
     check_criteria,
     length_test_of,
 )
@@ -37,11 +37,13 @@ from jaxbundle.report.verdict import BAD, GOOD
 
 @dataclasses.dataclass(frozen=True)
 class Judgement:
-    """What was asked of a result, and what was found; nothing without options."""
+    """What was asked of a result, and what was found; nothing without options. `refused`: why
+    lengths, or a certificate, cannot be of this result."""
 
     acceptance: Acceptance | None = None
     lengths: LengthTest | None = None
     document: Certificate | None = None
+    refused: str = ""
 
     @property
     def json(self) -> dict[str, Any]:
@@ -96,17 +98,27 @@ class Judge:
         """The judgement of a result; none of one without a solution."""
         if not np.all(result.converged):
             return WITHOUT_RESULT
-        test = None
-        if self.lengths is not None:
-            details = self.details
-            options = {"mpe": details.mpe or None, "rule": details.rule, "volume": details.volume}
-            test = length_test_of(result, self.lengths, **options)
-        acceptance = accept(result, self.criteria, lengths=test) if self.criteria else None
-        document = None
-        if self.certificate:
-            document = certificate(result, details=self.details, lengths=test, origin=origin)
+        test, document, acceptance, refused = None, None, None, ""
+        # The result of hours is written first: what cannot be judged is refused by `end`.
+        try:
+            if self.lengths is not None:
+                details = self.details
+                test = length_test_of(
+                    result,
+                    self.lengths,
+                    mpe=details.mpe or None,
+                    rule=details.rule,
+                    volume=details.volume,
+                )
+            if self.certificate:
+                document = certificate(result, details=self.details, lengths=test, origin=origin)
+        except InputError as error:
+            refused = str(error)
+        if self.criteria:
+            acceptance = accept_known(result, self.criteria, test)
+        if document is not None:
             document = dataclasses.replace(document, acceptance=acceptance)
-        return Judgement(acceptance, test, document)
+        return Judgement(acceptance, test, document, refused)
 
     def write(self, judgement: Judgement) -> None:
         """Write the certificate."""
@@ -116,7 +128,10 @@ class Judge:
     def end(self, judgement: Judgement) -> None:
         """End the command with a line for each criterion that is not met.
 
-        **Raises:** `typer.Exit` with status 4 if there are any."""
+        **Raises:** `InputError` for what cannot be judged, though the result is written;
+        `typer.Exit` with status 4 if criteria are not met."""
+        if judgement.refused:
+            raise InputError(judgement.refused)
         end_unmet(judgement.acceptance)
 
 

@@ -130,7 +130,9 @@ def remarks(adjustment: "Adjustment") -> list[str]:
     unit, sentences = adjustment.image_unit, []
     sizes = not_none(adjustment.error_model).sizes[1:]
     for size in sorted(sizes, key=lambda size_found: -size_found.score):
-        name, in_camera, camera = size.name.partition(" of ")
+        # "given points out of plane" is a whole name, "principal distance … of cam" has a camera.
+        whole = size.name in REMARKS
+        name, in_camera, camera = (size.name, "", "") if whole else size.name.partition(" of ")
         if size.size > 0 and name in REMARKS:
             amount = f"{significant(size.size, 2)} {unit if size.unit == IMAGE else 'a priori σ'}"
             words = REMARKS[name].format(amount)

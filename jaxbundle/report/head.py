@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxbundle.leastsquares.iterations.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.leastsquares.quality.global_test import describe_test
-from jaxbundle.network.blunders import removed_rays
+from jaxbundle.network.blunders import Removed, removed_rays
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.tables import ESTIMATED, ROLES, STATED, UNIT
@@ -112,13 +112,18 @@ def first_facts(
     facts_said = [f"{left_out}: see Notes, and left_out in the JSON"] if left_out else []
     if removals := adjustment.removed:
         rays = len(removed_rays(removals))
-        others = sum(len(item.rows) for item in removals) - rays
+        others = count_removed(removals) - rays
         numbers = ((rays, "image point"), (others, "other observation"))
         words = ", ".join(count(n, noun) for n, noun in numbers if n)
         if excluded := int(adjustment.problem.excluded.sum()):
             words += f" and with them {count(excluded, 'object point')}"
         facts_said.append(f'{words} by data snooping: see Data snooping, and "removed" in the JSON')
     return [*rows, ("Left out", "; ".join(facts_said))] if facts_said else rows
+
+
+def count_removed(removals: Iterable[Removed]) -> int:
+    """The number of observations that were removed, inseparable ones among them."""
+    return sum(len(item.rows) for item in removals)
 
 
 def left_out_in_words(adjustment: "Adjustment") -> str:
@@ -318,6 +323,7 @@ def evaluations(adjustment: "Adjustment") -> tuple[np.ndarray, np.ndarray, np.nd
 def image_sigmas(adjustment: "Adjustment") -> np.ndarray:
     """The distinct a priori σ of the image coordinates, ascending."""
     weight = adjustment.problem.image_weights
+    # Weights are 1/σ: σ that were equal in the file differ in the last digits on the way back.
     return np.unique(np.round(1 / weight[weight > 0], 12))
 
 

@@ -336,6 +336,8 @@ def predicted_control(adjustment: "Adjustment", max_rows: int) -> list[str]:
     rows = predicted_rows(points, ("id",), "XYZ")
     lines = [*heading(f"Control predicted from all other observations, in {unit}")]
     lines += table(CONTROL_HEADER, rows[:max_rows], "lrrrrrrr")
+    if len(rows) > max_rows:
+        lines.append(f"{len(rows) - max_rows} more, less improbable, are in the JSON.")
     if rays:
         listed = predicted_rows(rays, ("image", "point"), "xy")
         number_shown = min(max_rows, MEASUREMENTS_SHOWN)

@@ -10,6 +10,7 @@ from jaxbundle.leastsquares.quality.distributions import (
 from jaxbundle.leastsquares.quality.global_test import describe_test, is_tested
 from jaxbundle.refinement import UNIT_OF_WEIGHT, Refinement
 from jaxbundle.refinement.check_points import RefinementCheckPoints
+from jaxbundle.report.head import count_removed
 from jaxbundle.report.layout import significant
 from jaxbundle.report.verdict import (
     LEVEL,
@@ -45,6 +46,7 @@ def conclude_refinement(result: Refinement) -> Verdict:
 def _blunders(result: Refinement, test: dict, w: np.ndarray) -> Finding:
     """By Baarda's w with σ that were stated, else Pope's τ."""
     is_stated = is_tested(result.redundancy, test["sigma_origin"])
+    number_removed = count_removed(result.removed)
     return judge_blunders(
         np.abs(w) if is_stated else np.abs(w) / result.sigma0,
         lambda level: (
@@ -53,8 +55,8 @@ def _blunders(result: Refinement, test: dict, w: np.ndarray) -> Finding:
             else tau_quantile(1 - level / 2, result.redundancy)
         ),
         "|w|" if is_stated else "|τ|",
-        len(result.removed),
-        len(w) / 2 + len(result.removed),
+        number_removed,
+        len(w) / 2 + number_removed,
     )
 
 

@@ -11,6 +11,7 @@ from jaxbundle.report.correlated import first_facts, stated_sigma, stated_sigma_
 from jaxbundle.report.head import (
     chi_squared,
     count_points,
+    count_removed,
     image_precision,
     image_residuals_in_words,
     left_out_in_words,
@@ -75,13 +76,13 @@ def summary(adjustment: "Adjustment") -> list[tuple[str, str]]:
             *_far_points(adjustment),
             ("Largest |τ|", _worst(adjustment)),
         ]
-    for noun, remarks in (
-        ("removed observation", adjustment.removed),
-        ("eliminated parameter", adjustment.eliminated),
-        ("warning", adjustment.warnings),
+    for noun, number in (
+        ("removed observation", count_removed(adjustment.removed)),
+        ("eliminated parameter", len(adjustment.eliminated)),
+        ("warning", len(adjustment.warnings)),
     ):
-        if remarks:
-            rows.append(("Note", f"{count(len(remarks), noun)}: see report()"))
+        if number:
+            rows.append(("Note", f"{count(number, noun)}: see report()"))
     return rows
 
 

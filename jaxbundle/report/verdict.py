@@ -17,7 +17,7 @@ from jaxbundle.leastsquares.quality.global_test import contradicts
 from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.tables import ESTIMATED
 from jaxbundle.report.correlated import has_shared_errors, remarks
-from jaxbundle.report.head import chi_squared, open_datum
+from jaxbundle.report.head import chi_squared, count_removed, open_datum
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.observations import count_weak, critical_value
 from jaxbundle.types import not_none
@@ -245,16 +245,16 @@ def _free_network(adjustment: "Adjustment") -> Finding:
 
 
 def _held_control(adjustment: "Adjustment", parts: str) -> Finding:
-    """Points without σ are exact: their errors are in the image residuals, and three of them fit
-    any network."""
+    """Points without σ are exact: their errors are in the image residuals."""
     rows, points = adjustment.residuals, adjustment.problem.network.points
     ids = [id for id, fixed in zip(points.id, points.has_role("fixed")) if fixed]
     is_of_control = (rows["kind"] == "image") & np.isin(rows["point"], np.array(ids, object))
     largest, limit, test_in_words = _tested(adjustment, is_of_control)
     words, brief = f"{parts} held exactly, because no σ is stated; ", "control held exactly"
-    # Three points are a similarity: they fit any network.
+    # Of nine coordinates of three points a similarity takes seven. The two that are left test
+    # lengths in their plane: an error at right angles to it turns the network, and does not show.
     if len(ids) <= 3 or np.isnan(largest):
-        return Finding("Control", DOUBTFUL, words + "nothing tests so few: state σ", brief)
+        return Finding("Control", DOUBTFUL, words + "so few do not test each other: state σ", brief)
     state = GOOD if largest <= limit else DOUBTFUL
     return Finding(
         "Control", state, f"{words}largest |τ| of their image points {test_in_words}", brief
@@ -293,6 +293,9 @@ def judge_check_points(
     of the largest of them; `sigma_of`: of what, in words.
     """
     largest = float(np.fmax.reduce(ratio, initial=np.nan))
+    if np.isnan(largest):
+        words = f"{count(number, 'point')}; {rms}; no difference has a σ that it could be tested by"
+        return Finding("Check points", DOUBTFUL, words, "check points not tested")
     words = (
         f"{count(number, 'point')}; {rms}; largest difference {significant(largest)} times its "
         f"σ{sigma_of}, critical value {significant(limit)}"
@@ -321,7 +324,7 @@ def describe_reliability(
 
 
 def _blunders(adjustment: "Adjustment") -> Finding:
-    number_removed = len(adjustment.removed)
+    number_removed = count_removed(adjustment.removed)
     return judge_blunders(
         np.abs(adjustment.residuals["tau"]),
         lambda level: critical_value(adjustment, level=level),

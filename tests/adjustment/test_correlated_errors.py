@@ -325,7 +325,10 @@ def test_errors_of_given_points_are_found(clean):
     rng = np.random.default_rng(2)
     off = points.position + 0.003 * rng.normal(size=X.shape)
     wrong = given.replace(points=dataclasses.replace(points, position=off))
-    sizes = jaxbundle.adjust(wrong, correlated=True).error_model.sizes[-2:]
+    displaced = jaxbundle.adjust(wrong, correlated=True)
+    sizes = displaced.error_model.sizes[-2:]
+    said = " ".join(correlated.remarks(displaced))
+    assert "displaced in its plane" in said and "out of its plane" in said
     assert [size.name for size in sizes] == ["given points in plane", "given points out of plane"]
     # 3 mm at 6 m are 0.75 pixels across the line of sight; of the three axes two thirds of that
     # square, 0.61 pixels, in both components together

@@ -91,6 +91,8 @@ def test_cameras_that_are_held_are_no_measurands(document):
         ({"evaluation": {"volume": [1, 2]}}, "three sides"),
         ({"evaluation": {"measurands": ["c"]}}, "KIND:ID:NAME"),
         ({"input": [{"limits": 1.0}]}, "input 1: name is missing"),
+        ({"evaluation": {"mpe": "50"}}, r"\[evaluation\], mpe: MPE '50': expected A UNIT"),
+        ({"input": [{"name": "camera:cam:K3", "sigma": 1, "k": 2}]}, "k is the coverage factor"),
         ({"input": [{"name": "camera:cam:K3"}]}, "one of sigma, limits, expanded"),
         ({"input": [{"name": "camera:cam:K3", "sigma": -1}]}, "positive"),
         (
@@ -114,6 +116,15 @@ def test_inputs_of_details():
     assert found.held("deg")["image:1:phi"].uncertainty == pytest.approx(np.deg2rad(0.01))
     assert found.held("deg")["image:1:phi"].degrees == 9
     assert found.inputs["camera:a:K1"].uncertainty == pytest.approx(6**0.5)
+
+
+def test_a_length_test_made_otherwise_than_the_details_say_is_refused(document):
+    """The one that was made with them is taken."""
+    result, test = document.result, document.lengths
+    assert jaxbundle.certificate(result, details=DETAILS, lengths=test).lengths is test
+    for change in ({"mpe": "2 mm"}, {"rule": "simple acceptance"}, {"volume": [9, 9, 9]}):
+        with pytest.raises(InputError, match=f"^{next(iter(change))} of the details"):
+            jaxbundle.certificate(result, details={"evaluation": change}, lengths=test)
 
 
 def test_lengths_are_readable():

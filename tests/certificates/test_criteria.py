@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 import jaxbundle
-from jaxbundle.certificates.acceptance import accept, check_criteria
+from jaxbundle.certificates.acceptance import AcceptanceRow, accept, check_criteria
+from jaxbundle.certificates.check_differences import CheckDifferences, check_point_quantities
 from jaxbundle.certificates.criteria import read_criteria, read_criterion
+from jaxbundle.certificates.lengths import read_lengths
 from jaxbundle.certificates.quantities import offered
+from jaxbundle.certificates.quantity import Subject
 from jaxbundle.certificates.units import PixelPitch, convert
+from jaxbundle.cli.judgement import Judge
 from jaxbundle.errors import InputError, NotSolvedError
 
 ROOT = Path(__file__).parents[2]
@@ -144,6 +148,12 @@ def test_criteria_are_checked_before_the_work():
         ("check.rms < 1 mm", "'model', which is no length"),
         ("sigma(camera:other:c) < 1 um", "no camera 'other'"),
         ("sigma(r0) < 1", "held, and not estimated"),
+        ("t(X0) > 2", "only parameters of cameras"),
+        ("correlation(image:*:Z0) < 0.9", "only parameters of cameras"),
+        ("sigma(cam:c) < 1 mm", "KIND:ID:NAME"),
+        ("sigma(foo:7:X0) < 1 m", "KIND:ID:NAME"),
+        ("sigma(point:*:c) < 1 mm", "no 'c' of a point; known: X, Y, Z"),
+        ("sigma(image:7:Z) < 1 mm", "no 'Z' of an image"),
         ("views > 3", "unknown quantity"),
         ("sigma0 < 1 px", "without unit"),
     ):
@@ -181,6 +191,32 @@ def test_a_result_without_a_solution_is_not_judged():
 
     with pytest.raises(NotSolvedError, match="no solution"):
         accept(Unsolved(), "sigma0 < 1")
+
+
+def test_what_cannot_be_judged_does_not_lose_the_result(convergent4):
+    """Lengths of a network without scale, and a criterion that is refused, are said at the end."""
+    lengths = read_lengths({"from": ["1"], "to": ["2"], "value": [1.0], "sigma": [0.0]})
+    judge = Judge(("sigma(nothing) < 1", "sigma0 < 2"), lengths=lengths)
+    judgement = judge.judge(convergent4)
+    assert [row.met for row in judgement.acceptance.rows] == [False, True]
+    with pytest.raises(InputError, match="no scale"):
+        judge.end(judgement)
+
+
+def test_heights_alone_meet_no_criterion_of_three_axes():
+    difference = np.array([[np.nan, np.nan, 0.1]])
+    differences = CheckDifferences(["a"], difference, "m")
+    rms = check_point_quantities(lambda _: differences)[0]
+    for argument in ("H", "3D"):
+        with pytest.raises(LookupError):
+            rms.find(Subject(None), argument)
+    for argument in ("V", "Z", ""):
+        assert rms.find(Subject(None), argument).values[""] == pytest.approx(0.1)
+
+
+def test_an_infinite_value_is_said():
+    row = AcceptanceRow(read_criterion("chi2 < 1"), math.inf)
+    assert row.said == "inf" and not row.met
 
 
 def test_numbers_that_are_none_are_not_accepted(convergent4):
@@ -243,4 +279,3 @@ def test_a_calibration_is_judged_and_certified(command, tmp_path):
     told = command("calibrate", ROOT / "examples" / "board", "--board", "9x6", "--square", "0.03",
                    "--accept", "sigma(c) < 1 px")  # fmt: skip
     assert told.status == 2 and "no parameter 'c'" in told.err
-

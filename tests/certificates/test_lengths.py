@@ -19,6 +19,7 @@ from jaxbundle.certificates.lengths import (
     read_mpe,
 )
 from jaxbundle.certificates.positional import PositionalAccuracy, positional_accuracy
+from jaxbundle.certificates.quantities import find_quantity
 from jaxbundle.errors import InputError
 
 
@@ -45,7 +46,11 @@ def test_errors_by_hand():
 @pytest.mark.parametrize(
     ("error", "verdict"),
     [
-        (40e-6, CONFORMS), (-40e-6, CONFORMS), (43e-6, OPEN), (57e-6, OPEN), (59e-6, FAILS),
+        (40e-6, CONFORMS),
+        (-40e-6, CONFORMS),
+        (43e-6, OPEN),
+        (57e-6, OPEN),
+        (59e-6, FAILS),
         (-59e-6, FAILS),
     ],
 )
@@ -83,13 +88,23 @@ def test_the_arrangement_that_vdi_wants():
     assert [met for *_, met in test.requirements()] == [True, True, False]
     wide = dataclasses.replace(test, diagonal=50.0)
     assert [met for *_, met in wide.requirements()] == [True, True, True]
+    # Three repetitions of a length are one length of its line, and are listed.
+    repeated = join_length_tests([test] * 3)
+    assert repeated.requirements()[:3] == test.requirements()
+    assert repeated.requirements()[3][1:] == ("≥ 3", "3", True)
+    twice = join_length_tests([test, length_test(np.zeros(34), 0.0)])
+    assert twice.requirements()[3][2:] == ("1", False)
     few = length_test(np.zeros(9), 0.0)
     assert [met for *_, met in few.requirements()][:2] == [False, False]
 
 
-def test_repetitions_are_joined():
+def test_repetitions_are_joined(convergent4):
     one, two = length_test(np.array([1e-5]), 1e-6), length_test(np.array([-9e-5]), 1e-6)
-    assert join_length_tests([one, two, one]).largest == pytest.approx(9e-5)
+    joined = join_length_tests([one, two, one])
+    assert joined.largest == pytest.approx(9e-5)
+    # The characteristic that criteria name is the same, wherever the worst repetition stands.
+    (error,) = find_quantity(convergent4, joined, "LME", "").values.values()
+    assert error == pytest.approx(9e-5)
     with pytest.raises(InputError, match="one unit"):
         join_length_tests([one, dataclasses.replace(two, unit="mm")])
     with pytest.raises(InputError, match="at least one"):
@@ -152,6 +167,25 @@ def test_lengths_to_check_points_are_measured_and_those_between_control_not(fiel
         length_errors(result, {"from": ["1"], "to": ["2"], "value": [1.0], "sigma": [1e-6]})
 
 
+def test_lengths_of_a_network_without_scale_are_refused(field):
+    """One control point leaves rotations and the scale open."""
+    network = field[0].network
+    points, none = (
+        network.points,
+        dataclasses.replace(
+            network.distances, points=np.zeros((0, 2), int), value=np.zeros(0), sigma=np.zeros(0)
+        ),
+    )
+    one = dataclasses.replace(
+        points, role=tuple("control" if id == "1" else "tie" for id in points.id),
+        sigma=np.where(np.array(points.id)[:, None] == "1", points.sigma, np.nan),
+    )  # fmt: skip
+    free = jaxbundle.adjust(network.replace(points=one, distances=none, datum="inner"))
+    assert free.counts.datum == 4
+    with pytest.raises(InputError, match="has no scale"):
+        length_errors(free, {"from": ["13"], "to": ["14"], "value": [1.0], "sigma": [1e-6]})
+
+
 def test_bad_tables_of_lengths():
     good = {"from": ["a"], "to": ["b"], "value": [1.0], "sigma": [0.0]}
     assert len(read_lengths(good)) == 1
@@ -192,6 +226,31 @@ def test_asprs_heights_only_means_and_poor_surveys():
     assert len(found.statements()) == 1
     said = " ".join(found.remarks())
     assert "mean error in Z" in said and "vertical survey" in said
+
+
+def test_asprs_tests_only_directions_that_have_check_points():
+    """A class without points is neither met nor silently passed; σ that are not stated are not
+    0."""
+    d = np.array([[0.03, 0.04, np.nan], [0.03, -0.04, np.nan]])
+    sigma = np.array([[0.02, 0.02, np.nan], [np.nan] * 3])
+    found = PositionalAccuracy(("a", "b"), d, sigma, "m", 0.1, 0.1)
+    assert found.survey == (pytest.approx(np.hypot(0.02, 0.02)), 0.0)
+    assert found.verdict == "" and dataclasses.replace(found, vertical_class=None).verdict == "met"
+    assert dataclasses.replace(found, horizontal_class=0.01).verdict == "not met"
+    said = " ".join([*found.statements(), *found.remarks()])
+    assert "vertical accuracy class of 10.0 cm RMSE_V is not tested: no check point has Z" in said
+    assert "stated of 1 of 2 check points" in said and "vertical survey" not in said
+    only_x = dataclasses.replace(found, difference=np.array([[0.03, np.nan, np.nan]] * 2))
+    assert only_x.number == (0, 0) and not only_x.enough
+
+
+def test_check_points_without_differences_leave_the_certificate(field, monkeypatch):
+    result, _ = field
+    blank = np.full_like(result.check_points.difference, np.nan)
+    unknown = dataclasses.replace(result.check_points, difference=blank)
+    monkeypatch.setattr(result, "check_points", unknown)
+    (part,) = jaxbundle.certificate(result).parts
+    assert part.accuracy is None and "no check points with given coordinates" in part.no_accuracy
 
 
 def test_asprs_of_an_adjustment(field):

@@ -15,5 +15,9 @@ def describe_budget(budget: "Budget | None") -> Addition:
     """The error budget on the page of an adjustment, if there is one."""
     if budget is None:
         return NO_ADDITION
-    content = grid(HEADER, select_rows(budget)[0], "words") + paragraph(LEGEND)
+    rows, number_of_others = select_rows(budget)
+    content = grid(HEADER, rows, "words")
+    if number_of_others:
+        content += paragraph(f"… and {number_of_others} more: all are in budget.csv.")
+    content += paragraph(LEGEND)
     return Addition(sections=(Section("budget", TITLE, content, "Budget"),))

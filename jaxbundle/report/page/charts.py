@@ -226,8 +226,8 @@ def _ticks(scale: Scale, logarithmic: bool, whole_numbers: bool = False) -> Tick
 
 
 def _round_values(low: float, high: float, whole_numbers: bool = False) -> np.ndarray:
-    """About five round numbers between two; `whole_numbers`: whole ones where there are at least "
-    "two."""
+    """About five round numbers between two; `whole_numbers`: whole ones where there are at least
+    two."""
     rough = (high - low) / 5
     if whole_numbers and np.floor(high) > np.ceil(low):
         rough = max(rough, 1.0)

@@ -46,6 +46,21 @@ def grid(header: Sequence[object], rows: Iterable[Sequence[object]], kind: str =
     return f'<div class="wide"><table{_class(kind)}>\n{cells}</table></div>\n'
 
 
+def grid_of_first(
+    header: Sequence[object],
+    rows: Sequence[Sequence[object]],
+    max_rows: int,
+    kind: str = "",
+    all_are: str = "",
+) -> str:
+    """The first rows of a table, and how many more there are; `all_are`: where all of them are."""
+    number_of_others = len(rows) - max_rows
+    table = grid(header, rows[:max_rows], kind)
+    if number_of_others <= 0:
+        return table
+    return table + paragraph(f"… and {number_of_others} more{all_are and f': all are {all_are}'}.")
+
+
 def figure(drawing: str, caption: object) -> str:
     """A drawing over its caption."""
     return f"<figure>\n{drawing}<figcaption>{text(caption)}</figcaption></figure>\n"

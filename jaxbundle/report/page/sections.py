@@ -15,7 +15,7 @@ from jaxbundle.report.layout import clean, fixed, significant
 from jaxbundle.report.observations import count_by_class
 from jaxbundle.report.page.charts import Curve, draw_curves, draw_histogram
 from jaxbundle.report.page.document import Section
-from jaxbundle.report.page.markup import facts, figure, grid, items, paragraph, text
+from jaxbundle.report.page.markup import facts, figure, grid, grid_of_first, items, paragraph, text
 from jaxbundle.report.unknowns import validity
 
 if TYPE_CHECKING:
@@ -190,16 +190,16 @@ def predicted_control(adjustment: "Adjustment") -> Iterator[Section]:
     points, rays = (adjustment.table(name) for name in ("control", "control_measurements"))
     if not points:
         return
-    rows = observations.predicted_rows(points, ("id",), "XYZ")
+    rows, most = observations.predicted_rows(points, ("id",), "XYZ"), observations.ROWS_OF_PAGE
     parts = [
         paragraph(observations.PREDICTION_LEGEND),
-        grid(observations.CONTROL_HEADER, rows[: observations.ROWS_OF_PAGE]),
+        grid_of_first(observations.CONTROL_HEADER, rows, most, all_are="in the JSON"),
     ]
     if rays:
         listed = observations.predicted_rows(rays, ("image", "point"), "xy")
         parts += [
             f"<h3>Image measurements of control, in {text(adjustment.image_unit)}</h3>\n",
-            grid(observations.MEASUREMENT_HEADER, listed[: observations.ROWS_OF_PAGE]),
+            grid_of_first(observations.MEASUREMENT_HEADER, listed, most, all_are="in the JSON"),
         ]
     unit = clean(adjustment.network.object_unit)
     title = f"Control predicted from all other observations, in {unit}"
