@@ -1,14 +1,18 @@
 """A file of results is kept whole, every key once, and written by one run at a time."""
 
 import json
+import math
 import os
 import stat
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
+from jaxbundle.io.results.parquet import write_parquet
+from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.writing.locks import hold_lock
 
 
@@ -104,3 +108,15 @@ def test_a_tail_of_zeros_is_cut(tmp_path):
     path = tmp_path / "results.jsonl"
     path.write_bytes(b'{"key": "a"}\n' + bytes(50))
     assert [*JsonLines(path).heads] == ["a"] and path.read_bytes() == b'{"key": "a"}\n'
+
+
+def test_what_is_not_finite_is_null_in_tuples_too():
+    document = {"a": (1.0, math.nan), "b": [(math.inf,)]}
+    assert without_nan(document) == {"a": [1.0, None], "b": [[None]]}
+
+
+def test_words_that_are_missing_are_null_in_parquet(tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    words = np.array(["a", None, "None"], object)
+    write_parquet(tmp_path / "t.parquet", {"word": words})
+    assert parquet.read_table(tmp_path / "t.parquet")["word"].to_pylist() == ["a", None, "None"]

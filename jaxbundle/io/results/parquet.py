@@ -26,12 +26,13 @@ def need_pyarrow() -> None:
 
 
 def write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write columns of numbers and words; NaN becomes null."""
+    """Write columns of numbers and words; NaN and None become null."""
     need_pyarrow()
     arrow, parquet = map(importlib.import_module, ("pyarrow", "pyarrow.parquet"))
+    as_words = lambda values: [x if x is None else str(x) for x in values]
     arrays = {
         name: arrow.array(
-            [str(x) for x in values] if values.dtype.kind in "OU" else values, from_pandas=True
+            as_words(values) if values.dtype.kind in "OU" else values, from_pandas=True
         )
         for name, values in columns.items()
     }

@@ -148,7 +148,7 @@ def without_nan(value: Any) -> Any:
     """NaN and infinity do not exist in JSON: null."""
     if isinstance(value, dict):
         return {key: without_nan(v) for key, v in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [without_nan(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
