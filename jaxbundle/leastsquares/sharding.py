@@ -162,7 +162,8 @@ def _share_rows(
     problem: Problem, parts: int
 ) -> tuple[tuple[Int[np.ndarray, " n"], ...], list[dict[str, Int[np.ndarray, " n"]]]]:
     """For every device the eliminated rows, and the observations of every set: parts of equal work,
-    in order. Kept rows, and rows that share an observation, belong to the first device."""
+    in order. Observations of kept rows alone, and of rows that share an observation, belong to the
+    first device."""
     e, observation_sets = problem.plan.eliminated, problem.observations
     touched_rows = [
         [r for name, r in zip(o.kind.of, o.rows) if name == e] for o in observation_sets
@@ -174,7 +175,8 @@ def _share_rows(
             number_of_rays += np.bincount(rows, minlength=len(stays))
             is_coupled[rows] |= len(slots) > 1
     # An observation costs as much as three to four pairs of incidences: BAL 16, one core, 24 ms for
-    # the derivatives, sums and residuals of 83 718 observations, 14 ms for 170 046 pairs: 3.5.
+    # the derivatives, sums and residuals of 83 718 observations, 14 ms for 170 046 pairs: 3.5. It
+    # matters for the balance of the devices alone.
     work = np.where(
         is_coupled, 0.0, number_of_rays * (number_of_rays - 1) / 2 + 3.0 * number_of_rays
     )

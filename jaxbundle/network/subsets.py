@@ -82,7 +82,8 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
 def record_left_out(
     network: Network, noun: str, names: Iterable[str], why: str, measured: bool = True
 ) -> Network:
-    """The network with a note that these were left out; see `LeftOut`."""
+    """The network with a note that these were left out; see `LeftOut`. `measured`: with image
+    points that count in the verdict of the report."""
     names = tuple(names)
     if not names:
         return network

@@ -116,7 +116,8 @@ class ControlTable:
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table as text, the RMS last."""
-        # Decimals by σ: two significant digits of it, for all lengths alike.
+        # Decimals by σ: two significant digits of it (GUM, 7.2.6), for all lengths alike; at most
+        # a tenth of a millimetre, which no control in metres exceeds.
         places = column_decimals(np.concatenate([point.sigma for point in self.points]), 2, 4)
         rows = [point.cells(places) for point in self.points]
         for role, words in (("control", "RMS, used control"), ("check", "RMS, check points")):

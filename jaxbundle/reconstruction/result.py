@@ -152,7 +152,7 @@ def distances_found(result: Adjustment) -> str:
     return "".join(
         f", principal distance {c['value']:.2f} ± {stated_sigma_of(c):.2f} px ({id})"
         for id, c in principal_distances(result).items()
-        if c["free"] and c["sigma"]
+        if c["free"] and c["sigma"]  # 0 of an exact fit says nothing
     )
 
 

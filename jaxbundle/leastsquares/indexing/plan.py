@@ -44,7 +44,8 @@ class Member(eqx.Module):
 
 
 class UnknownGroup(eqx.Module):
-    """A block row of the normal equations; `free` is 0 for held directions."""
+    """A block row of the normal equations; `free` is 0 for held directions; `all_free`: there are
+    none, so that the program multiplies by no mask."""
 
     members: tuple[Member, ...]
     free: Float[Array, "n w"]
@@ -74,7 +75,8 @@ class TouchedRows(eqx.Module):
 
 class Coupling(eqx.Module):
     """Two touches of a part and the block of the reduced matrix of their rows: in every chunk the
-    block's number, and whether the first row stands in its row (0) or its column (1).
+    block's number, and whether the row of the first touch is that of the block (0) or its column
+    (1): of one group only blocks of a later row with an earlier one are stored. None of two groups.
     `same`: 1 if both are the same row, None if never."""
 
     first: int = eqx.field(static=True)

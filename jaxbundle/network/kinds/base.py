@@ -153,7 +153,7 @@ class ObservationTable(abc.ABC):
     @property
     def needs_scale(self) -> bool:
         """Whether a σ is a length that does not define the scale: the residuals shrink with the
-        network, so its scale must be known."""
+        network, so its scale must be known: a network whose scale is open is refused."""
         return False
 
     def number_of_equations(self) -> int:
