@@ -82,8 +82,8 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
 def record_left_out(
     network: Network, noun: str, names: Iterable[str], why: str, measured: bool = True
 ) -> Network:
-    """The network with a note that these were left out; see `LeftOut`. `measured`: with image
-    points that count in the verdict of the report."""
+    """The network with a note that these were left out; see `LeftOut`. `measured`: something
+    is lost, which the verdict of the report counts."""
     names = tuple(names)
     if not names:
         return network
