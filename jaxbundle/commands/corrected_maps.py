@@ -282,6 +282,8 @@ def _fingerprint(
 def _input_files(scanner: str | Path, *sources: str | Path | None) -> list[Path]:
     """The files of the scanner, and of sources, those of folders among them."""
     files = files_read(scanner)
+    if Path(scanner).suffix.lower() in IMAGES:
+        files.append(find_coefficients(Path(scanner)))
     for source in sources:
         if source is not None and os.path.exists(source):
             folder = Path(source)

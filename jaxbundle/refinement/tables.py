@@ -124,7 +124,7 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
 
 def has_upright_checks(earth: Ellipsoid | None) -> bool:
     """Whether check points are compared along east, north, up: above an ellipsoid of revolution."""
-    return earth is not None and earth.a == earth.b
+    return earth is not None and bool(earth.a == earth.b)
 
 
 def check_points_table(points: GroundPoints) -> None:

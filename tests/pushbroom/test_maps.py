@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from jaxbundle.commands.corrected_maps import _fingerprint
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
-from jaxbundle.io.rasters.maps import MapSystem, contiguous, grid_around
+from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
 from jaxbundle.pushbroom import Ground
 
 LATTICE = np.meshgrid(179.7 + 0.02 * np.arange(33), -16 + 0.02 * np.arange(33))
@@ -42,6 +43,20 @@ def test_a_projected_system_has_an_edge():
 def test_no_system_of_maps(crs, words):
     with pytest.raises(InputError, match=words):
         MapSystem(WGS84, crs)
+
+
+@pytest.mark.parametrize("scanner, part", [
+    ("a.IMD", "a.ATT"), ("a.imd", "a.eph"), ("a.tif", "a_RPC.TXT"), ("a.toml", "a.csv"),
+])  # fmt: skip
+def test_the_blocks_of_a_map_depend_on_all_that_is_read(tmp_path, scanner, part):
+    for name in (scanner, part, "image.tif"):
+        (tmp_path / name).write_text('table = "a.csv"')
+    of_map = lambda: _fingerprint(
+        tmp_path / scanner, tmp_path / "image.tif", None, None, MapGrid(0.0, 0.0, 1.0, 2, 2), None
+    )
+    before = of_map()
+    (tmp_path / part).write_text("another")
+    assert of_map() != before
 
 
 def test_a_map_that_is_too_large():

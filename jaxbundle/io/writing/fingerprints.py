@@ -38,6 +38,7 @@ IN_FOLDERS = "cam*/sensor.yaml"
 # Files that are read with a file of a name or a suffix and not named in it; {stem}: its name.
 COMPANIONS = {
     "reconstruction.json": ("tracks.csv", "ground_control_points.json", "reference_lla.json"),
+    ".imd": ("{stem}.[eE][pP][hH]", "{stem}.[aA][tT][tT]", "{stem}.[gG][eE][oO]"),
     ".out": ("list.txt",),
     ".phc": ("{stem}.ior", "{stem}.eor", "{stem}.obc", "{stem}.scale"),
     ".psx": (
