@@ -1,5 +1,7 @@
 """The TOML of anipose: its poses against OpenCV's projection, and back; what is refused."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.io import read_network
+from jaxbundle.io.networks.anipose import write_anipose
 from jaxbundle.io.text.csv_tables import read_toml
 
 X = np.array([[-300.0, 200.0, 2000.0], [100.0, -150.0, 1500.0], [400.0, 300.0, 2500.0]])
@@ -55,6 +58,14 @@ def test_what_is_refused(tmp_path, change, message):
     path.write_text(path.read_text().replace(*change, 1))
     with pytest.raises(InputError, match=message):
         read_network(path)
+
+
+def test_coefficients_that_it_has_no_place_for_are_refused(tmp_path):
+    network = read_network(write_sample(tmp_path, "anipose"))
+    first, *others = network.cameras
+    prism = dataclasses.replace(first, parameters={**first.parameters, "s1": 1e-4})
+    with pytest.raises(InputError, match="camera 'left': anipose has no s1"):
+        write_anipose(network.replace(cameras=(prism, *others)), tmp_path / "prism.toml")
 
 
 def test_a_camera_without_a_pose_is_not_in_the_rig(tmp_path):

@@ -120,6 +120,7 @@ BROKEN = {
     "missing": (("map.toml", "[table.images]", "[table.distances]"), "table.images. is missing"),
     "toml": (("map.toml", "[[camera]]", "[[camera"), "not valid TOML"),
     "project": (("map.toml", "image_unit", "image_unti"), "unknown key 'image_unti'"),
+    "constant": (("map.toml", 'camera = "1"', 'X0 = "0"'), "constant 'X0' is a column of the file"),
     "skip": (("map.toml", "skip = 1", "skip = -1"), "skip is -1"),
 }
 

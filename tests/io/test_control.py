@@ -1,5 +1,6 @@
 """Control from a table of its own: its forms, what it replaces, and another frame of the input."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -14,8 +15,11 @@ from jaxbundle.cli.outputs import check_targets
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.networks.bundler import write_bundler
-from jaxbundle.io.networks.control import read_control
+from jaxbundle.io.networks.control import read_control, with_control
 from jaxbundle.io.networks.project import write_project
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.kinds import Antennas
+from jaxbundle.network.tables import Source
 
 TURN, SCALE = Rotation.from_euler("xyz", [0.3, -0.2, 0.7]).as_matrix(), 40.0
 SHIFT = np.array([999_000.0, 112_000.0, 130.0])
@@ -76,6 +80,31 @@ def test_control_in_mm_for_start_values_in_m_is_said(tmp_path, scale, said):
     assert said in told and "control.csv" in told
 
 
+@pytest.mark.parametrize("frame", FRAME)
+def test_what_else_is_observed_in_the_frame_of_the_input(tmp_path, frame):
+    """σ of check points that the table does not have turn with the frame; antennas are left out."""
+    input, _ = project(tmp_path)
+    net = read_network(input)
+    points = net.points
+    roles = tuple("check" if k == 5 else role for k, role in enumerate(points.role))
+    sigma = np.full_like(points.sigma, np.nan)
+    sigma[5] = 0.01, 0.02, 0.03
+    columns = {"image": net.images.id, **dict(zip("XYZ", POSITION.T))}
+    columns |= {f"s{axis}": [0.1] * 3 for axis in "XYZ"}
+    gps = Antennas.from_columns(Columns(columns, Source("gps")), {}, 1.0)
+    points = dataclasses.replace(points, role=roles, sigma=sigma)
+    net = with_control(
+        net.replace(points=points, further=(gps,)),
+        read_control(table(tmp_path, FRAME[frame](POINTS))),
+    )
+    A = SCALE * TURN if frame == "another" else np.eye(3)
+    covariance = A @ np.diag(sigma[5] ** 2) @ A.T
+    assert net.points.role[5] == "check"
+    assert_allclose(net.points.sigma[5], np.sqrt(np.diag(covariance)), rtol=1e-9)
+    told = any("3 observed positions of antennas" in line for line in net.warnings)
+    assert told == (frame == "another") == (not net.further)
+
+
 def test_points_without_coordinates_are_intersected_to_find_the_frame(tmp_path):
     lines = export().splitlines()
     text = "\n".join(line for line in lines if not (len(line.split()) == 7 and line[1:2] != " "))
@@ -110,6 +139,8 @@ def test_forms_without_header(tmp_path):
     path.write_text("P1 1 2 3 0.1 0.1 0,2\nP2 4 5,5 6 0.1 0.1 0.2\n")
     assert_allclose(read_control(path).position[1], [4, 5.5, 6])
     assert_allclose(read_control(path).sigma[0], [0.1, 0.1, 0.2])
+    path.write_text("North corner, 1.0, 2.0, 3.0\n")
+    assert read_control(path).id == ("North corner",)
     path.write_text("P1,1,2,3\n")
     assert read_control(path).role == ("control",) and np.isnan(read_control(path).sigma).all()
 

@@ -327,6 +327,9 @@ def test_cameras_in_a_body(tmp_path):
     net = read_network(folder)
     assert net.images.id == ("cam0", "cam1") and net.cameras[0].image_size == (752, 480)
     assert_allclose(net.images.position[1], [0.1, 0, 0], atol=1e-12)
+    (folder / "cam0").rename(folder / "cam10")
+    assert read_network(folder).images.id == ("cam1", "cam10")
+    (folder / "cam10").rename(folder / "cam0")
     (camera,) = read_cameras(folder / "cam0" / "sensor.yaml")
     assert camera.id == "cam0" and camera.parameters["p2"] == 1.76187114e-05
 
@@ -337,6 +340,7 @@ def test_visualsfm(tmp_path):
     path.write_text(NVM)
     net = read_network(path)
     assert net.images.id == ("a b.jpg", "c.jpg") and net.points.id == ("0",)
+    assert net.observations.sigma_origin == "unit"  # the file states no σ
     assert_allclose(net.points.position[0], [0.75, 0.5, 0.125])
     for i, (f, r, m) in enumerate([(1000, -0.02, [60, -61]), (1100, 0.03, [55.5, 66.5])]):
         own = net.cameras[net.images.camera[i]]

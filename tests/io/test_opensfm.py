@@ -1,6 +1,7 @@
 """OpenSfM's reconstructions: its own formulas for one point, files by hand, there and back."""
 
 import copy
+import dataclasses
 import json
 
 import numpy as np
@@ -15,6 +16,8 @@ from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
 from jaxbundle.io import convert, read_cameras, read_network
 from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.losses import describe_losses
+from jaxbundle.io.networks.opensfm_writing import OPENSFM_LOSSES
 from jaxbundle.network.kinds import Antennas
 
 W, H = 1280, 720
@@ -145,6 +148,17 @@ def test_there_and_back(tmp_path):
     assert_allclose(again.further[0].position, POSITION, atol=1e-12)
 
 
+def test_one_dop_for_axes_of_different_sigma_is_told(tmp_path):
+    write(tmp_path, *files(gps=True))
+    net = read_network(tmp_path)
+    (gps,) = net.further
+    assert not any("antennas" in told for told in describe_losses(net, OPENSFM_LOSSES))
+    covariance = gps.covariance.copy()
+    covariance[1] = np.diag([0.02, 0.02, 0.5]) ** 2
+    net = net.replace(further=(dataclasses.replace(gps, covariance=covariance),))
+    assert "antennas (1)" in describe_losses(net, OPENSFM_LOSSES)
+
+
 def convert_to(net, folder):
     from jaxbundle.io import write_project
 
@@ -169,6 +183,7 @@ BROKEN = {
     "kind": (lambda s: s[1]["cameras"]["v2 cam 1.5"].update(projection_type="x"), "_type is x"),
     "focal": (lambda s: s[1]["cameras"]["v2 cam 1.5"].pop("focal_x"), "1.5'?, focal_x is missing|"
               "focal_x is missing"),
+    "aspect": (lambda s: s[1]["cameras"]["v2 cam 1.5"].update(aspect_ratio=1.5), "_ratio 1.5 is"),
     "width": (lambda s: s[1]["cameras"]["v2 cam 1.5"].update(width=0), "width is 0; expected a"),
     "rotation": (lambda s: s[1]["shots"]["b.jpg"].update(rotation=[1, 2]), "b.jpg'?: rotation is"),
     "NaN": (lambda s: s[1]["points"]["3"].update(coordinates=[0, 1, None]), "points '3': coord"),

@@ -214,6 +214,7 @@ def test_a_scaled_base_system_is_told(tmp_path):
         ("calibrated.json", "perspective", "spherical", "a spherical sensor is not read"),
         ("calibrated.json", '"type"', '"radial_scale": 2, "type"', "may change the geometry"),
         ("calibrated.json", '"focal_length_px": 1000.0', '"focal_length_px": -1', "a positive one"),
+        ("projected.json", '"sigmas": [0.01', '"sigmas": [0', "sigmas of control point 'G0' are"),
         ("tracks.gltf", "3.bin", "none.bin", "cannot be read"),
         ("tracks.gltf", '"count": 9', '"count": 900', "bytes, where"),
         ("tracks.gltf", '"componentType": 5126', '"componentType": 9', "numbers of type 9"),

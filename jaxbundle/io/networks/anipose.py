@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.networks.assemble import all_parameters, rig_network, unique_labels
+from jaxbundle.io.networks.assemble import rig_network, unique_labels
 from jaxbundle.io.networks.kalibr import CORE, EQUI, RADTAN, mounted_losses, mountings_of
-from jaxbundle.io.networks.losses import PIXEL_MODELS, describe_losses, size_of
+from jaxbundle.io.networks.losses import check_others_zero, describe_losses, size_of
 from jaxbundle.io.networks.poses import matrices_of_rotation_vectors, rotation_vectors_of
 from jaxbundle.io.text.csv_tables import read_toml, write_text
 from jaxbundle.io.text.json_fields import JsonFields
@@ -140,7 +140,8 @@ def write_anipose(network: Network, path: str | Path) -> tuple[str, ...]:
 
     **Returns:** messages about what the format cannot hold.
 
-    **Raises:** `InputError` for a camera of another model, or without image size.
+    **Raises:** `InputError` for a camera of another model, with coefficients of distortion that the
+    file cannot have, or without image size.
     """
     mountings, losses = mountings_of(network), []
     if mountings is None and len(network.cameras) > 1:
@@ -159,13 +160,9 @@ def write_anipose(network: Network, path: str | Path) -> tuple[str, ...]:
 
 
 def _camera_section(camera: Camera) -> dict[str, Any]:
-    p, (w, h) = all_parameters(camera), size_of(camera, "anipose")
-    if camera.model not in PIXEL_MODELS:
-        raise InputError(
-            f"camera {camera.id!r}: anipose has no model {str(camera.model)!r}; convert it with "
-            "--model opencv"
-        )
     fisheye = camera.model == "kannala-brandt"
+    p = check_others_zero(camera, "anipose", EQUI if fisheye else OPENCV)
+    w, h = size_of(camera, "anipose")
     # Anipose itself reads five; the rational terms only where they are needed.
     number = 4 if fisheye else len(OPENCV) if any(p[name] for name in OPENCV[5:]) else 5
     names = (EQUI if fisheye else OPENCV)[:number]

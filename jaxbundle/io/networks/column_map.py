@@ -149,6 +149,7 @@ def _read_table(folder: Path, where: str, entry: Mapping) -> Columns:
             raise InputError(f"{where}: scale of {name!r}: no such column of numbers")
         if isinstance(factor, bool) or not isinstance(factor, int | float) or factor == 0:
             raise InputError(f"{where}: scale of {name} is {show(factor)}; expected a number")
+    _check_constants(where, constant, column_index)
     skip, decimal = entry.get("skip", 0), entry.get("decimal", ".")
     if isinstance(skip, bool) or not isinstance(skip, int) or skip < 0:
         raise InputError(f"{where}: skip is {show(skip)}; expected a number of lines")
@@ -184,6 +185,15 @@ def _table(where: str, entry: Mapping, key: str) -> dict:
     if not isinstance(value, dict):
         raise InputError(f"{where}: {key} is {show(value)}; a table such as {{ x = 1 }} expected")
     return value
+
+
+def _check_constants(where: str, constant: Mapping, column_index: Mapping[str, int]) -> None:
+    for name in constant:
+        if name in column_index:
+            raise InputError(
+                f"{where}: constant {name!r} is a column of the file as well; leave one of them "
+                f"out ({UNUSED_COLUMN!r} in columns: not used)"
+            )
 
 
 def _separator(where: str, entry: Mapping) -> str | None:

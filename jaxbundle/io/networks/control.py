@@ -8,7 +8,7 @@ a role its points are control points, those without σ held.
 The table replaces the control of the input: control and fixed points missing from the table
 become tie points. If the start values of the input are in another frame (PhotoModeler shifts
 them), a similarity through the common points transforms images and points into that of the
-table.
+table; observed positions of antennas are then left out.
 """
 
 import csv
@@ -25,8 +25,10 @@ from jaxbundle.arguments import show
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.poses import angles_of, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.rows import is_number
 from jaxbundle.network.build import POINT_ERRORS, POINT_SIGMAS
 from jaxbundle.network.columns import Columns, count, did_you_mean, list_some
+from jaxbundle.network.kinds import Antennas
 from jaxbundle.network.rules import AXES, check_choice, check_unique
 from jaxbundle.network.tables import ROLES, Images, Network, Points, Source
 from jaxbundle.network.unit_mistakes import name_degrees
@@ -117,7 +119,10 @@ def read_control(path: str | Path) -> Points:
 def _separator(line: str) -> str | None:
     """The separator of the columns: a comma unless it is a decimal comma between blanks."""
     separator = next((s for s in (";", "\t", ",") if s in line), None)
-    decimal = separator == "," and any(len(cell.split()) > 1 for cell in line.split(","))
+    cells = line.split(",")
+    # `North corner, 1.0, 2.0, 3.0`: a blank within an id.
+    is_row = len(cells) in (4, len(BARE_COLUMNS)) and all(map(is_number, cells[1:]))
+    decimal = separator == "," and not is_row and any(len(cell.split()) > 1 for cell in cells)
     return None if decimal else separator
 
 
@@ -243,7 +248,8 @@ def with_control(
     roles = np.array(points.role, dtype=object)
     roles[points.has_role("control", "fixed") & ~in_table] = "tie"
     roles[point_rows] = [control.role[k] for k in rows]
-    position, sigma = points.position.copy(), np.full_like(points.sigma, np.nan)
+    position, sigma = points.position.copy(), points.sigma.copy()
+    sigma[roles == "tie"] = np.nan
     position[point_rows], sigma[point_rows] = control.position[rows], control.sigma[rows]
     changed = {"datum": "control"} if datum and set(roles) & {"control", "fixed"} else {}
     network = network.replace(
@@ -311,6 +317,14 @@ def _transform_into_frame(
     # X' = scale·R·X + t   ⇒   M·(X − X0) ∝ M·Rᵀ·(X' − X0')
     M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t
+    # Of check points; NaN and infinity, of an axis, become those of the point.
+    sigma = np.sqrt(np.square(points.sigma) @ np.square(A).T)
+    further = tuple(kind for kind in network.further if not isinstance(kind, Antennas))
+    if left_out := sum(len(k.image) for k in network.further if isinstance(k, Antennas)):
+        network = network.warn(
+            f"{count(left_out, 'observed position')} of antennas (GNSS) of the input are left out: "
+            f"they are in its frame, and that of the control of {control.source.name} is another"
+        )
     return network.replace(
         images=Images(
             images.id,
@@ -320,7 +334,8 @@ def _transform_into_frame(
             images.sigma,
             images.source,
         ),
-        points=dataclasses.replace(points, position=position),
+        points=dataclasses.replace(points, position=position, sigma=sigma),
+        further=further,
     ).note(
         "the start values of the input are in another frame than the control: a similarity by "
         f"{count(len(source), 'point')} was applied (scale {scale:.6g})"

@@ -129,8 +129,7 @@ def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     unknown.check((key for key in document if not CAMERA_KEY.fullmatch(key)), FILE, path)
     chain = {
         id: JsonFields(f"{path}, {id}", document[id])
-        # By number: cam10 after cam9.
-        for id in sorted(filter(CAMERA_KEY.fullmatch, document), key=_camera_number)
+        for id in sorted(filter(CAMERA_KEY.fullmatch, document), key=camera_number)
         if isinstance(document[id], dict)
     }
     if not chain:
@@ -206,7 +205,8 @@ def _transform(fields: JsonFields, key: str) -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def _camera_number(id: str) -> int:
+def camera_number(id: str) -> int:
+    """The number of cam10, which comes after cam9; −1 of another name."""
     digits = id.removeprefix("cam")
     return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 9 else -1
 

@@ -30,6 +30,7 @@ from jaxbundle.io.cameras.slam_yaml import (
     read_yaml_fields,
 )
 from jaxbundle.io.networks.assemble import rig_network
+from jaxbundle.io.networks.kalibr import camera_number
 from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.text.known_keys import Keys, UnknownKeys
 from jaxbundle.network.tables import Camera, Network
@@ -56,7 +57,10 @@ def read_vins(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     fields, unknown = read_yaml_fields(path), UnknownKeys()
     unknown.check(fields.document, BODY_KEYS, path)
     cameras, poses = [], []
-    keys = sorted(filter(CALIB.fullmatch, fields.document))
+    keys = sorted(
+        filter(CALIB.fullmatch, fields.document),
+        key=lambda key: camera_number(key.removesuffix("_calib")),
+    )
     if not keys:  # within another object, or in another file of the same name
         raise InputError(f"{path}: cam0_calib is missing at the first level; it is expected there")
     # A monocular setting may still name the second camera, without its place.
@@ -81,7 +85,9 @@ def read_euroc(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
     **Raises:** `InputError` naming file and key."""
     path = Path(path)
-    files = sorted(path.glob(f"cam*/{SENSOR}"))
+    files = sorted(
+        path.glob(f"cam*/{SENSOR}"), key=lambda file: (camera_number(file.parent.name), file)
+    )
     if not files:
         raise InputError(f"{path}: there is no cam0/{SENSOR} in it")
     cameras = [read_opencv(file) for file in files]

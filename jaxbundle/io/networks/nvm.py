@@ -41,7 +41,7 @@ from jaxbundle.io.networks.assemble import (
 from jaxbundle.io.networks.poses import matrices_of_quaternions
 from jaxbundle.io.text.rows import TextRow, TextRows, is_number
 from jaxbundle.network.columns import Columns, count
-from jaxbundle.network.tables import Network, Source
+from jaxbundle.network.tables import UNIT, Network, Source
 from jaxbundle.system.file_content import beginning
 
 HEAD = "NVM_V3"
@@ -146,7 +146,9 @@ def _network(
     xy = (rays[:, 2:4] - offset[rays[:, 0].astype(np.int64)]) * [PIXEL, -PIXEL]
     return assemble(
         path,
-        foreign_document(path.stem, cameras, image_unit="mm", residuals="corrected"),
+        foreign_document(
+            path.stem, cameras, image_unit="mm", residuals="corrected", sigma_origin=UNIT
+        ),
         overrides,
         image_columns(Source(str(path), np.array(lines), "line"), names, names, M, p[:, 5:8]),
         Columns(

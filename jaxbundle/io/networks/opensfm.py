@@ -311,6 +311,11 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     """Our camera; **Raises:** `NoPlaceError` if no model fits."""
     kind = fields.text("projection_type", "perspective")
     size = fields.integer("width", minimum=1), fields.integer("height", minimum=1)
+    if (ratio := fields.number("aspect_ratio", 1.0)) != 1:
+        raise InputError(
+            f"{fields.path}: aspect_ratio {ratio:g} is not read; expected 1, with focal_x and "
+            "focal_y of projection_type brown for two focal lengths"
+        )
     if kind in SPHERICAL:
         f = max(size) / (2 * np.pi)
         middle = {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose
@@ -91,14 +92,28 @@ def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
     return describe_losses(network, OPENSFM_LOSSES)
 
 
-# What it loses; antennas with a lever arm or drifts are no projection centres.
+def _antennas_changed(network: Network) -> int:
+    """How many antennas are not written, or with another covariance than they have."""
+    antenna_tables = [kind for kind in network.further if isinstance(kind, Antennas)]
+    return sum(
+        len(antennas.image)
+        if antennas.settings
+        else sum(not _is_isotropic(C) for C in antennas.covariance)
+        for antennas in antenna_tables
+    )
+
+
+def _is_isotropic(C: Float[np.ndarray, "3 3"]) -> bool:
+    # 1e-12: a σ that is squared and extracted again is off by a few eps (2e-16)
+    mean_variance = np.trace(C) / 3
+    return bool((abs(C - mean_variance * np.eye(3)) <= 1e-12 * mean_variance).all())
+
+
+# What it loses: antennas with a lever arm or drifts are no projection centres, and gps_dop is one σ
+# for all axes.
 OPENSFM_LOSSES = losing(
     "pixel sizes of cameras",
-    partly={
-        Antennas.TABLE: lambda n: sum(
-            len(k.image) for k in n.further if isinstance(k, Antennas) and k.settings
-        )
-    },
+    partly={Antennas.TABLE: _antennas_changed},
 )
 
 

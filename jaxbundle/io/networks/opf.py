@@ -36,6 +36,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.arguments import show
 from jaxbundle.cameras.scalars import Scalar
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
@@ -336,11 +337,17 @@ def _control(
             )
         return points, rays, None
     names = [row.text("id") for row in control_rows]
+    sigma = np.array([row.array("sigmas", (3,)) for row in control_rows])
+    for k in np.flatnonzero(~(sigma > 0).all(1))[:1]:
+        raise InputError(
+            f"{control_rows[k].path}: sigmas of control point {names[k]!r} are "
+            f"{show(sigma[k].tolist())}; expected positive numbers"
+        )
     control = Points(
         tuple(names),
         tuple("check" if is_check[name] else "control" for name in names),
         np.array([row.array("coordinates", (3,)) for row in control_rows]) - shift,
-        np.array([row.array("sigmas", (3,)) for row in control_rows]),
+        sigma,
         Source(str(resources.path)),
     )
     # Fewer than three points do not determine the seven parameters of a datum.

@@ -185,8 +185,9 @@ def _size_and_name(
     folder: Path, name: str, image_size: Sequence[float] | None, where: str
 ) -> tuple[tuple[int, int], str]:
     """The size of a photograph, and its name with suffix if it is beside."""
-    # XMP files have the stem of their photograph only
-    for file in (folder / name, *(folder / f"{name}{suffix}" for suffix in PHOTOGRAPHS)):
+    # XMP files have the stem of their photograph only; cameras write IMG_1.JPG
+    suffixes = (*PHOTOGRAPHS, *map(str.upper, PHOTOGRAPHS))
+    for file in (folder / name, *(folder / f"{name}{suffix}" for suffix in suffixes)):
         if file.suffix.lower() in PHOTOGRAPHS and file.is_file():
             return photograph_size(file), file.name
     if image_size is None:
@@ -308,14 +309,14 @@ def _rotation_from_heading(heading: float, pitch: float, roll: float) -> Float[n
 
 
 def _heading_of(R: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
-    """Heading, pitch and roll of a rotation camera → object, degrees; of a camera whose image rows
-    are vertical (pitch ±90°) roll is 0."""
-    pitch = math.asin(min(1.0, max(-1.0, R[2, 1])))
-    # 1e-12: rounding of a product of three rotations, beyond which two angles become one
-    if abs(R[2, 1]) > 1 - 1e-12:
-        heading, roll = -math.atan2(R[1, 0], R[0, 0]), 0.0
-    else:
-        heading, roll = math.atan2(R[0, 1], R[1, 1]), math.atan2(-R[2, 0], R[2, 2])
+    """Heading, pitch and roll of a rotation camera → object, degrees."""
+    heading = math.atan2(R[0, 1], R[1, 1])
+    # Not asin, whose slope at 90° is infinite.
+    pitch = math.atan2(R[2, 1], math.hypot(R[0, 1], R[1, 1]))
+    # The first row of R_y(roll) = R_x(−pitch)·R_z(heading)·R: of a camera whose image columns are
+    # vertical (pitch ±90°) any heading will do with the roll that belongs to it.
+    ch, sh = math.cos(heading), math.sin(heading)
+    roll = math.atan2(ch * R[0, 2] - sh * R[1, 2], ch * R[0, 0] - sh * R[1, 0])
     return math.degrees(heading), math.degrees(pitch), math.degrees(roll)
 
 
