@@ -196,7 +196,10 @@ def adjust(  # noqa: PLR0913 - the options of the command
             control,
             {
                 "--set": ", ".join(set or ()),
+                "--format": format,
                 "--check": ", ".join(check or ()),
+                "--method": method,
+                "--reduction": reduction,
                 "--max-iterations": max_iterations,
                 "--robust": robust,
                 "--snooping": snooping,

@@ -9,6 +9,9 @@ from jaxbundle.choices import HAND_EYE
 from jaxbundle.cli import calibration_options as options
 from jaxbundle.cli.app import Json, app, choice
 from jaxbundle.cli.certificate_options import Accept
+from jaxbundle.errors import InputError
+
+KIND, DICTIONARY, MODEL = "chessboard", "DICT_4X4_50", "opencv"
 
 
 @app.command("hand-eye", example="photos --poses robot.csv --board 9x6 --square 0.03")
@@ -34,10 +37,10 @@ def hand_eye_command(  # noqa: PLR0913 - the options of the command
     ] = None,
     board: Annotated[str, typer.Option(help="COLUMNSxROWS: inner corners of a board")] = "",
     square: options.Square = "",
-    kind: options.Kind = "chessboard",
+    kind: options.Kind = KIND,
     marker: options.Marker = None,
-    dictionary: options.Dictionary = "DICT_4X4_50",
-    model: options.Model = "opencv",
+    dictionary: options.Dictionary = DICTIONARY,
+    model: options.Model = MODEL,
     accept: Accept = None,
     json: Json = "",
 ) -> None:
@@ -61,6 +64,20 @@ def hand_eye_command(  # noqa: PLR0913 - the options of the command
             input, poses, board=board_of_photographs, model=model, **settings
         )
     else:
+        _refuse_board_options(
+            square=square != "",
+            kind=kind != KIND,
+            marker=marker is not None,
+            dictionary=dictionary != DICTIONARY,
+            model=model != MODEL,
+        )
         network = input[0] if len(input) == 1 else input
         result = jaxbundle.hand_eye(network, poses, **settings)
     print_result(result, json, accept=accept)
+
+
+def _refuse_board_options(**is_given: bool) -> None:
+    """Refuse options of a board where there is none: the network has its camera and its points."""
+    for option, given in is_given.items():
+        if given:
+            raise InputError(f"--{option}: it is for photographs of a board; give --board, too")

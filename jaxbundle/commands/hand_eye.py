@@ -46,10 +46,7 @@ class HandEye(TableMethods):
         """Camera → hand (eye in hand) or camera → base (eye to hand): x' = T·x. The camera looks
         along −z, y up; `name`: of one of several cameras."""
         table = self.adjustment.unknowns(TABLES[self.poses.type].eye)
-        labels = self.cameras
-        if name is not None and name not in labels:
-            raise InputError(f"camera is {name!r}; expected one of {', '.join(labels)}")
-        row = 0 if name is None else labels.index(name)
+        row = self._row(name)
         M = np.asarray(matrix_from_quaternion(table.value.rotation[row]))
         return transformation(M.T, table.value.position[row])
 
@@ -57,6 +54,12 @@ class HandEye(TableMethods):
     def cameras(self) -> list[str]:
         """The names of the cameras."""
         return [*self.adjustment.further_unknowns[TABLES[self.poses.type].eye]]
+
+    def _row(self, name: str | None) -> int:
+        labels = self.cameras
+        if name is not None and name not in labels:
+            raise InputError(f"camera is {name!r}; expected one of {', '.join(labels)}")
+        return 0 if name is None else labels.index(name)
 
     @property
     def frame(self) -> Float[np.ndarray, "4 4"]:
@@ -68,8 +71,7 @@ class HandEye(TableMethods):
     def covariance(self, name: str | None = None) -> Float[np.ndarray, "6 6"]:
         """Of the position of the camera (object unit) and a small rotation about the axes of the
         camera (radians), a posteriori."""
-        labels = self.cameras
-        row = 0 if name is None else labels.index(name)
+        row = self._row(name)
         return self.adjustment.unknowns(TABLES[self.poses.type].eye).covariance[row]
 
     @property

@@ -52,7 +52,8 @@ def test_photographs_to_camera(calibrate, folder, tmp_path, monkeypatch):
     page = (out / "report.html").read_text()
     assert page == (tmp_path / "page.html").read_text()
     said = Page(page).texts["td"]
-    assert "no chessboard" in " ".join(said) and "--snooping" in Page(page).texts["th"]
+    assert "no chessboard" in " ".join(said)
+    assert {"--snooping", "--unit"} < {*Page(page).texts["th"]}
     sizes = {str(path.stat().st_size) for path in folder.glob("*.jpg")}
     assert sizes <= set(said)  # the photographs with their fingerprints
     first, *_, last = (out / "report.txt").read_text().strip().splitlines()

@@ -389,6 +389,10 @@ def test_the_command_and_the_function(seen, tmp_path, command, capsys):
     assert not found.doubts and "warning" not in str(found)
     with pytest.raises(InputError, match="repeatability"):
         jaxbundle.hand_eye(path, table)
+    with pytest.raises(InputError, match="camera is 'wrong'; expected one of"):
+        found.covariance("wrong")
+    told = command("hand-eye", path, "--poses", table, "--square", "0.03")
+    assert told.status == 2 and "--square: it is for photographs of a board" in told.err
     # the camera is said to stand before the robot: no pose agrees
     wrong = jaxbundle.hand_eye(
         path, table, type="eye-to-hand", sigma_position=SIGMA_P, sigma_angle=SIGMA_R
