@@ -10,6 +10,7 @@ import jaxbundle
 from jaxbundle.certificates.details import read_details
 from jaxbundle.certificates.page import readable_length
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.report.page.markup import grid_of_first
 
 DETAILS = {
     "certificate": {"number": "2026-014", "laboratory": "A <b>lab</b> & sons", "object": "camera"},
@@ -125,6 +126,12 @@ def test_a_length_test_made_otherwise_than_the_details_say_is_refused(document):
     for change in ({"mpe": "2 mm"}, {"rule": "simple acceptance"}, {"volume": [9, 9, 9]}):
         with pytest.raises(InputError, match=f"^{next(iter(change))} of the details"):
             jaxbundle.certificate(result, details={"evaluation": change}, lengths=test)
+
+
+def test_the_rest_of_a_long_table_is_counted():
+    rows = [("1",), ("2",), ("3",)]
+    assert "… and 1 more: all are in the JSON." in grid_of_first("a", rows, 2, "", "in the JSON")
+    assert "more" not in grid_of_first("a", rows, 3)
 
 
 def test_lengths_are_readable():

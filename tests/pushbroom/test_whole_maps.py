@@ -346,6 +346,14 @@ def test_bad_input_is_named(folder, tmp_path, monkeypatch, options, words):
     assert "\n" not in str(found.value) and os.listdir(tmp_path) == []
 
 
+def test_a_map_replaces_none_of_its_inputs(folder, tmp_path):
+    geoid = tmp_path / "geoid.tif"
+    geoid.write_text("heights")
+    with pytest.raises(InputError, match="--sigma .*geoid.tif: is part of the input"):
+        make(folder, tmp_path / "map.tif", geoid=geoid, sigma=geoid, errors={"ground": 1.0})
+    assert geoid.read_text() == "heights"
+
+
 def test_bands_of_several_types_are_refused(folder, tmp_path):
     vrt = (
         "<VRTDataset rasterXSize='400' rasterYSize='600'>"
