@@ -21,6 +21,7 @@ from jaxbundle.network.equation_counts import count_controlled_axes
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.image_conventions import (
     EXPECTED_CONVENTION,
+    convention_of,
     explains_better,
     image_frame,
 )
@@ -63,7 +64,8 @@ def name_mirrored(
     axes = "v (or u)" if unit == "px" else "y (or x)"
     return (
         f"the control points fit the mirror image of the network (σ0 {mirrored:.3g}{instead}): "
-        f"{REMEDY} or {axes} of the image coordinates (expected: {EXPECTED_CONVENTION[unit]})"
+        f"{REMEDY} or {axes} of the image coordinates "
+        f"(expected: {EXPECTED_CONVENTION[convention_of(network.cameras[0])]})"
     )
 
 

@@ -19,7 +19,7 @@ from jaxbundle.photographs.opencv import need_opencv
 
 Grey = UInt8[np.ndarray, "rows columns"]
 
-# More than any board sold has: 1000 markers, the largest dictionary, are 45 × 45 squares.
+# More than any board sold has.
 MAX_COLUMNS = 40
 # Three points of two rows fit an affine map of any numbering; six leave as many conditions.
 MIN_MARKERS = 6

@@ -86,7 +86,7 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     if not explains_better(medians[best], medians[IDENTITY, False]):
         return ""
     # As they were given: pixels may be of a camera in mm.
-    convention = _convention(network.cameras[0], network.image_unit)
+    convention = convention_of(network.cameras[0], network.image_unit)
     x, y = ("u", "v") if convention == "px" else ("x", "y")
     words = []
     if best[1]:
@@ -103,7 +103,7 @@ def name_image_convention(network: Network, settings: StartValueSettings = DEFAU
     )
 
 
-def _convention(camera: Camera, unit: str = "") -> str:
+def convention_of(camera: Camera, unit: str = "") -> str:
     """The key in `EXPECTED_CONVENTION` of coordinates in this unit, or in that of the model."""
     model = get_model(camera.model)
     unit = unit if unit in ("px", "mm") else model.unit
@@ -148,7 +148,7 @@ def name_image_extent(network: Network) -> str:
         centre, half_size = image_frame(camera)
         if not len(xy):
             continue
-        unit, convention = get_model(camera.model).unit, _convention(camera)
+        unit, convention = get_model(camera.model).unit, convention_of(camera)
         # Without a hundredth at either end: a few blunders would hide where the others are.
         low, high = np.quantile(xy, [0.01, 0.99], axis=0)
         if not np.isfinite(half_size).all():
