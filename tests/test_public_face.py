@@ -22,6 +22,8 @@ PRESENTATION = {
     "verbose",
     # jaxbundle.accept and jaxbundle.certificate of the result
     "accept", "certificate", "details", "lengths",
+    # jaxbundle.io.write_geopackage and write_geojson of the result
+    "crs", "gis",
 }  # fmt: skip
 """Options about files and screen, for which a result has methods or functions."""
 
