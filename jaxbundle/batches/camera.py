@@ -95,7 +95,8 @@ def solve_camera(
     redundancy = rows - len(free) - POSE * jnp.sum(views)
     zero = jnp.asarray(0.0)
     # Ends where no unknown would move by more than 1e-5 of its σ: the printed digits do not depend
-    # on the start, and as convergence is quadratic, this costs a step at most.
+    # on the start, and as convergence is quadratic, this costs a step at most. `size` stands for
+    # each measured coordinate, of whose rounding the arithmetic noise of residuals is a multiple.
     tolerance = Tolerance(redundancy, rows * size**2, zero + 1e-5, zero)
 
     def linearise(unknowns: CameraUnknowns) -> tuple[Float[Array, "views n n"], Float[Array, ""]]:

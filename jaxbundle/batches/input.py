@@ -200,8 +200,8 @@ class Batch:
         widths = self._widths(is_shown.sum(1), points, settings.points_worth_compiling)
         size = settings.cameras_on_cpu
         if not on_cpu:
-            max_views = settings.points_on_accelerator / (max(widths, default=1) * points)
-            power = math.log2(max(max_views, 1))
+            max_cameras = settings.points_on_accelerator / (max(widths, default=1) * points)
+            power = math.log2(max(max_cameras, 1))
             size = 2 ** min(math.floor(power), math.ceil(math.log2(max(len(self), 1))))
         for flat in (True, False):
             for width in np.unique(widths):

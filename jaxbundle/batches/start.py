@@ -49,7 +49,8 @@ class StartSettings:
       lie on the line.
     - `ordinary_focal`: focal length, in lengths of the image, where the views determine none: a
       field of view of 45°.
-    - `min_focal`, `max_focal`: in lengths of the image; others are no solution of the equations.
+    - `min_focal`, `max_focal`: in lengths of the image, fields of view of 169° and 1.1°; others are
+      no solution of the equations.
     - `steepest`: −cos of the angle to the axis, 75°, beyond which the plane coordinates of a
       fisheye's points are so long that they alone would decide the pose.
     """

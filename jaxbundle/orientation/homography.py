@@ -11,7 +11,7 @@ h₁, h₂ of each H give two equations of B = K⁻ᵀ·K⁻¹ (Zhang, 2000, IEE
 
     h₁ᵀ·B·h₂ = 0,        h₁ᵀ·B·h₁ = h₂ᵀ·B·h₂
 
-`batch.start` has the same idea for a thousand cameras at once, in another layout.
+`batches.start` has the same idea for a thousand cameras at once, in another layout.
 """
 
 import jax

@@ -128,7 +128,8 @@ def in_plane(
     if (-rays[:, 2] > MIN_COSINE).all():
         return np.eye(3), _in_plane(rays)
     axis = -rays.mean(0)
-    # The rotation that takes the axis to z; about x or y, whichever is farther from it.
+    # The new x is the old x or y made perpendicular to the new z: of these the one farther from z,
+    # which is never parallel to it.
     start_axis = np.eye(3)[np.argmin(np.abs(axis[:2]))]
     z = axis / np.linalg.norm(axis)
     x = start_axis - (start_axis @ z) * z

@@ -119,8 +119,7 @@ def start_cameras(
 
 
 def with_lens(cameras: Sequence[Camera], positions: Sequence[int], camera: Camera) -> list[Camera]:
-    """The cameras; those at positions `positions` with the principal distance and K1 of "
-    "`camera`."""
+    """The cameras; those at `positions` with the principal distance and K1 of `camera`."""
     names = [name for name in ("fx", "fy", "k1") if name in camera.parameters]
     lens_parameters = {name: camera.parameters[name] for name in names}
     with_same = lambda c: dataclasses.replace(c, parameters={**c.parameters, **lens_parameters})

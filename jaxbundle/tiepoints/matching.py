@@ -86,8 +86,9 @@ def match_features(
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)
     nearest_back, _, second_back = nearest(b[best[rows]], a)
-    # Descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b)
-    # also the matched ones: two features equal to one of the other photograph have the ratio 1.
+    # Descriptors closer than 1e-3 are equal: three times √ε of float32, the rounding of √(1 − a·b).
+    # This floor holds for the best, too: if two features equal one of the other photograph, the
+    # ratio is 1.
     equal = 1e-3
     distance_ratio = np.maximum(distance[rows], equal) / np.maximum(
         np.minimum(second_distance[rows], second_back), equal

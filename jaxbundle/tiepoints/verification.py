@@ -138,16 +138,16 @@ def verify_pairs(
         return verified
     find = lambda rows: _find_agreeing(rows, xy1, xy2, tolerance, settings)
     # First the unique matches alone; then all, where enough are added to make it another trial.
-    agreed_by_distinct = find({k: np.flatnonzero(unique[k]) for k in usable})
+    agreed_by_unique = find({k: np.flatnonzero(unique[k]) for k in usable})
     agreed = find(
         {
             k: np.arange(len(xy1[k]))
             for k in usable
-            if k not in agreed_by_distinct and (~unique[k]).sum() >= min_matches
+            if k not in agreed_by_unique and (~unique[k]).sum() >= min_matches
         }
     )
-    agreed |= agreed_by_distinct
-    for k in agreed_by_distinct:
+    agreed |= agreed_by_unique
+    for k in agreed_by_unique:
         good, M, b = agreed[k]
         if (good & unique[k]).sum() >= settings.sufficient_matches:
             agreed[k] = good & unique[k], M, b
@@ -169,7 +169,7 @@ def verify_pairs(
     )
     for k, (good, angle, kind) in zip(pairs_left, kinds):
         _, M, b = agreed[k]
-        verified[k] = VerifiedPair(good, M, b, angle, kind, k in agreed_by_distinct)
+        verified[k] = VerifiedPair(good, M, b, angle, kind, k in agreed_by_unique)
     for k, (good, M) in turned.items():
         verified[k] = VerifiedPair(good, M, np.zeros(3), 0.0, "rotation", True)
     return verified

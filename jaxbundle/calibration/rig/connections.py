@@ -235,6 +235,8 @@ def _join_boards(poses: Poses, board_groups: _Groups, body_of_board: np.ndarray)
                 shared[h1, h2][e] = np.linalg.inv(poses_a[e]) @ poses_b[e]
     if not shared:
         return False
+    # One epoch is enough, unlike of cameras: two boards are mostly in one photograph, which cannot
+    # be paired wrongly.
     pair = max(shared, key=lambda pair: len(shared[pair]))
     _merge_boards(board_groups, *pair, medoid([*shared[pair].values()]))
     return True

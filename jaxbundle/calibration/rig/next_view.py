@@ -223,11 +223,13 @@ def _places(
     adjusted_camera, n = rig.camera(camera), settings.number
     model, size = get_model(adjusted_camera.model), np.array(not_none(adjusted_camera.image_size))
     p = tuple(adjusted_camera.parameters.values())
+    # With its middle nearer to an edge much of a board would be outside the image (`min_part`).
     uv = random.uniform(0.15, 0.85, (n, 2)) * size
     xy = in_model_units(uv, model, adjusted_camera.image_size, adjusted_camera.pixel_size)
     rays = np.stack(jax.vmap(lambda xy: image_ray(model, p, xy[0], xy[1]))(xy), -1)
     rays = rays / np.linalg.norm(rays, axis=1)[:, None]
     distances_of_boards = np.linalg.norm(rig.values("epoch").position, axis=1)
+    # Without the ends: a single epoch, or a wrong pose, is no distance to ask for.
     nearest, farthest = np.quantile(distances_of_boards, [0.05, 0.95]).tolist()
     distance = random.uniform(nearest, farthest, n)
     tilt, roll = random.uniform(0, settings.max_tilt, n), random.uniform(0, 180, n)

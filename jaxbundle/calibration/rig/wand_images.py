@@ -53,7 +53,7 @@ def measure_wand(
     notes = []
     for camera, frames_of_camera in frames.items():
         try:
-            marks, crowded = _measure(camera, frames_of_camera, cameras[camera], settings, progress)
+            marks, unused = _measure(camera, frames_of_camera, cameras[camera], settings, progress)
         except InputError as error:
             raise InputError(f"camera {camera!r}: {error}") from None
         if not marks:
@@ -64,9 +64,9 @@ def measure_wand(
             )
         marks_found[camera] = marks
         notes += [
-            f"camera {camera!r}: {count(crowded, 'frame')} without markers, or with more than "
+            f"camera {camera!r}: {count(unused, 'frame')} without markers, or with more than "
             f"{settings.max_blobs} blobs"
-        ] * bool(crowded)
+        ] * bool(unused)
     names = {
         camera: tuple(dict.fromkeys(m.frame for m in marks_of_camera))
         for camera, marks_of_camera in marks_found.items()
@@ -125,14 +125,14 @@ def _measure(
                 *size, *interior.image_size
             )
         )
-    marks, empty_frames = [], 0
+    marks, unused = [], 0
     for number_done, (name, grey) in enumerate(frames, 1):
         targets = find_moving_blobs(grey, scene, settings)
-        empty_frames += not targets
+        unused += not targets
         marks += [Mark(name, "", *t.xy.tolist(), *t.sigma.tolist()) for t in targets]
         if progress is not None:
             progress(f"{SEARCHING}, camera {camera}", number_done, frames.number)
-    return marks, empty_frames
+    return marks, unused
 
 
 def replaced_sigma(marks: Marks, sigma: float) -> Marks:
