@@ -109,15 +109,19 @@ def test_what_is_wrong_in_a_file(tmp_path, case):
         assert word in str(refused.value), refused.value
 
 
-@pytest.mark.parametrize("old, new, words", [
-    ('ude.csv"', 'ude.csv"\nframe = "orbit"', r"\[attitude\]: frame is 'orbit', earth is local"),
-    ('table = "positions.csv"', "circle = { height = 5e5 }\nspan = [0, 9]", "circle: an orbit is"),
+CIRCLE = 'table = "positions.csv"', "circle = { height = 5e5 }\nspan = [0, 9]"
+
+
+@pytest.mark.parametrize("earth, old, new, words", [
+    ('"local"', 'ude.csv"', 'ude.csv"\nframe = "orbit"', "frame is 'orbit', earth is local"),
+    ('"local"', *CIRCLE, r"\[position\]: circle: an orbit is about the Earth"),
+    ("[3396190, 3396190, 3376200]", *CIRCLE, r"\[position\]: circle: an orbit is about the Earth"),
 ])  # fmt: skip
-def test_an_orbit_needs_the_earth(tmp_path, old, new, words):
-    """In a local frame the direction from its origin is no vertical."""
-    local = TEXT.replace('name = "test"', 'earth = "local"')
+def test_an_orbit_needs_the_earth(tmp_path, earth, old, new, words):
+    """In a local frame the direction from its origin is no vertical; of Mars GM is another."""
+    elsewhere = TEXT.replace('name = "test"', f"earth = {earth}")
     with pytest.raises(InputError, match=words):
-        read_scanner(write_scanner(tmp_path, local.replace(old, new)))
+        read_scanner(write_scanner(tmp_path, elsewhere.replace(old, new)))
 
 
 KINDS = "Community Sensor Model (.json)", "DIMAP", "DigitalGlobe (.xml, .imd)"

@@ -300,9 +300,10 @@ def _orbit(
     file: TomlFile, section: TomlSection, kind: str, earth: Ellipsoid | None
 ) -> tuple[TimeTable, Source]:
     """Two-line elements, a circle, a state: as a table for interpolation."""
-    if earth is None:
+    # Ellipsoids of the Earth differ by a kilometre, other bodies by hundreds.
+    if earth is None or abs(float(earth.a) - float(WGS84.a)) > 10e3:
         raise InputError(
-            f'{section.where}{kind}: an orbit is about the Earth, but [scanner] earth is "local"; '
+            f"{section.where}{kind}: an orbit is about the Earth, which [scanner] earth is not; "
             "give a table of positions"
         )
     start, end = section.numbers("span", 2)
