@@ -21,7 +21,7 @@ from jaxbundle.errors import InputError
 
 P = ParamSpec("P")
 T = TypeVar("T")
-# Largest integer.
+# Fits in the 32-bit integers of compiled programs; no count here comes near it.
 LARGEST_INTEGER = 10**9
 
 
@@ -120,7 +120,6 @@ def numeric_array(name: str, values: Any, expected: str, truths: bool = False) -
     """Values as an array of real numbers, or of Booleans; a masked number becomes NaN, a masked
     Boolean False.
 
-
     **Raises:** `InputError` that says what is expected."""
     refuse_traced(name, values)
     masked = _stacked_masks(values)
@@ -188,14 +187,17 @@ def without_masks(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _stacked_masks(values: Any) -> np.ma.MaskedArray | None:
-    """A masked array, also from a list of masked arrays, whose masks `np.asarray` would lose."""
+    """A masked array, also from lists of masked arrays, whose masks `np.asarray` would lose."""
     if isinstance(values, np.ma.MaskedArray):
         return values
     if isinstance(values, list | tuple) and any(
-        isinstance(part, np.ma.MaskedArray) for part in values
+        isinstance(leaf, np.ma.MaskedArray) for leaf in jax.tree.leaves(values)
     ):
+        parts = [(part, _stacked_masks(part)) for part in values]
         try:
-            return np.ma.stack([np.ma.asanyarray(part) for part in values])
+            return np.ma.stack(
+                [np.ma.asanyarray(part if masked is None else masked) for part, masked in parts]
+            )
         except ValueError:
             return None
     return None

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxbundle.system.terminals import for_printing
 
+# 24 lines: the height of a terminal where nobody has changed it.
 LINES, WIDTH = 24, 100
 # Numbers of an array, or entries of a list, that are shown.
 SHOWN_ENTRIES = 4
@@ -55,7 +56,7 @@ def abbreviate(value: Any, depth: int = 0) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         short = value.size <= SHOWN_ENTRIES and isinstance(value, np.ndarray | np.generic)
         text = " ".join(str(value).split()) if short else f"{value.dtype}{[*value.shape]}"
-    elif isinstance(value, Mapping) and type(value).__repr__ is not describe:
+    elif isinstance(value, Mapping):
         parts = [f"{k!r}: {abbreviate(value[k], depth + 1)}" for k in [*value][:SHOWN_ENTRIES]]
         text = f"{{{', '.join(_with_total(parts, len(value), depth))}}}"
     elif isinstance(value, tuple | list):
@@ -68,6 +69,7 @@ def abbreviate(value: Any, depth: int = 0) -> str:
         text = f"<{type(value).__name__}{number}>"
     else:
         text = " ".join(repr(value).split())
+    # 24: the indent, the name of a field (20 letters), = and the comma stand on the same line.
     return text if len(text) <= WIDTH - 24 else f"{text[: WIDTH - 25]}…"
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import temporary
+from jaxbundle.system.terminals import in_utf8
 
 NO_UNITS: Mapping[str, str] = MappingProxyType({})
 
@@ -74,7 +75,7 @@ class ResultMethods(abc.ABC):
         text = json.dumps(finite(self.to_dict()), ensure_ascii=False) + "\n"
         try:
             with temporary(f"{os.fspath(path)}.{os.getpid()}.new") as new:
-                Path(new).write_text(text, encoding="utf-8")
+                Path(new).write_text(in_utf8(text), encoding="utf-8")
                 os.replace(new, path)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None

@@ -248,7 +248,8 @@ def test_tables_that_are_none():
 
 def test_masks_of_arrays_become_nan():
     mask = XY > 50
-    for given in (np.ma.masked_array(XY, mask), [np.ma.masked_array(*p) for p in zip(XY, mask)]):
+    rows = [np.ma.masked_array(*part) for part in zip(XY, mask)]
+    for given in (np.ma.masked_array(XY, mask), rows, [[*part] for part in rows]):
         assert_allclose(numeric_array("xy", given, "pixels"), np.where(mask, NAN, XY))
         np.testing.assert_array_equal(views(xy=given).visible, ~mask.any(2))
     whole = np.ma.masked_array([1, 2, 3], mask=[0, 1, 0])

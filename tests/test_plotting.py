@@ -24,7 +24,12 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.plotting import files, quality
 from jaxbundle.plotting.distortion import distortion_at
-from jaxbundle.plotting.ellipses import Ellipses, error_ellipses, principal_sections
+from jaxbundle.plotting.ellipses import (
+    Ellipses,
+    error_ellipses,
+    median_neighbour,
+    principal_sections,
+)
 from jaxbundle.plotting.style import extent, round_number
 from jaxbundle.plotting.views import camera_pyramids
 
@@ -275,6 +280,14 @@ def test_plan(convergent4, axes):
     size = [np.ptp(s, axis=0) / 2 for s in ellipses.get_segments()]
     sigma = np.stack([points["sX"], points["sY"]], 1)
     np.testing.assert_allclose(size, factor * sigma, rtol=5e-3)
+
+
+@pytest.mark.parametrize("number", [2, 401, 799])
+def test_the_median_distance_of_neighbours(number):
+    """Of a line with steps of 2, every place twice."""
+    places = np.repeat(2.0 * np.arange(number), 2)[:, None] * [1.0, 0.0, 0.0]
+    assert median_neighbour(places) == 2
+    assert median_neighbour(places[:2]) == np.inf
 
 
 def test_error_ellipses_lean_as_the_covariance(convergent4):

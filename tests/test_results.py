@@ -1,5 +1,6 @@
 """Every result offers the same methods (`jaxbundle.results.ReportedResult`)."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -81,6 +82,12 @@ def test_results_say_and_write_what_they_are(convergent4, tmp_path):
         assert [p.name for p in tmp_path.iterdir() if p.suffix != ".json"] == [], name
         number += 1
     assert number > 7
+
+
+def test_a_name_that_is_not_utf_8_is_written_as_it_can_be(tmp_path):
+    named = dataclasses.replace(camera(), id="caf\udce9")
+    jaxbundle.camera(named).save(tmp_path / "camera.json")
+    assert "caf\ufffd" in (tmp_path / "camera.json").read_text(encoding="utf-8")
 
 
 def test_a_result_that_cannot_be_written_says_where(tmp_path):

@@ -25,7 +25,14 @@ from jaxbundle.cameras.field_of_view import field_of_view_of_rays
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
-from jaxbundle.explorer.page import Number, draw_controls, draw_tools, make_page, place
+from jaxbundle.explorer.page import (
+    Number,
+    draw_controls,
+    draw_tools,
+    make_page,
+    place,
+    with_value,
+)
 from jaxbundle.explorer.view import File, Given, check_keys, number
 from jaxbundle.io.networks.project import cameras_text
 from jaxbundle.network.tables import Camera
@@ -113,7 +120,7 @@ class CameraView:
         controls = []
         for name, slope in zip(self.values, slopes):
             value, ranges = self.values[name], dict(self.model.ranges)
-            # A full slider moves that place by 4 % of the half diagonal: seen, and undone, at once.
+            # Half a slider moves that place by 4 % of the half diagonal: seen, and undone, at once.
             length = 0.04 * self.reach / slope if slope > 0 and np.isfinite(slope) else 1.0
             low, high = value - length, value + length
             if name in self.model.principal_distance:
@@ -166,7 +173,7 @@ class CameraView:
     def page(self, given: Given, live: bool) -> Page:
         """Sliders, curve, grid and photograph."""
         values = self.parameters(given)
-        controls = [c._replace(value=values[c.key]) for c in self._controls]
+        controls = [with_value(control, values[control.key]) for control in self._controls]
         sections = [
             Section(
                 "parameters",

@@ -159,12 +159,7 @@ class NetworkView:
         middle = self.adjustment.point_values[points_seen].mean(0)
         rays = (middle - X for X in (pose[:3], centre))
         old, new = (ray / (np.linalg.norm(ray) or 1.0) for ray in rays)
-        axis = np.cross(old, new)
-        sine, cosine = np.linalg.norm(axis), old @ new
-        if sine == 0:
-            return M  # the points are in the direction they were
-        turn = np.asarray(matrix_from_rotation_vector(axis / sine * np.arctan2(sine, cosine)))
-        return M @ turn.T
+        return M @ _smallest_turn(old, new).T
 
     def start(self, moves: list[Moved]) -> Values:
         """The adjusted values with the stations at their new places."""
@@ -288,8 +283,8 @@ class NetworkView:
         points that change most."""
         network, unit = self.problem.network, clean(self.adjustment.network.object_unit)
         # Held points have σ 0 before and after.
-        is_near = self.adjustment.located & (precision_before.points > 0).any(1)
-        root = lambda s: np.sqrt(np.mean(s[is_near] ** 2, 0))
+        is_free = self.adjustment.located & (precision_before.points > 0).any(1)
+        root = lambda s: np.sqrt(np.mean(s[is_free] ** 2, 0))
         rows = (
             [
                 (f"σ{axis} of the points, RMS [{unit}]", a, b)
@@ -297,7 +292,7 @@ class NetworkView:
                     "XYZ", root(precision_before.points), root(precision_after.points)
                 )
             ]
-            if is_near.any()
+            if is_free.any()
             else []
         )
         for c, camera in enumerate(network.cameras):
@@ -327,9 +322,9 @@ class NetworkView:
         table = grid(header, [(name, *_pair(a, b)) for name, a, b in rows])
         ids = np.array(network.points.id, dtype=object)
         change = np.where(
-            is_near, np.abs(np.log(_ratio(precision_before.points, precision_after.points))), -1
+            is_free, np.abs(np.log(_ratio(precision_before.points, precision_after.points))), -1
         )
-        order = [p for p in np.argsort(-change)[:max_points] if is_near[p]]
+        order = [p for p in np.argsort(-change)[:max_points] if is_free[p]]
         points = [
             (
                 ids[p],
@@ -414,6 +409,21 @@ class NetworkView:
         return Section("move", "Move a station", "".join(parts), "Move a station")
 
 
+def _smallest_turn(old: Float[np.ndarray, "3"], new: Float[np.ndarray, "3"]) -> np.ndarray:
+    """The rotation of one direction into another, about the axis across both."""
+    axis = np.cross(old, new)
+    sine, cosine = np.linalg.norm(axis), old @ new
+    # Below 1e-8 rounding has half the digits of the axis, and any axis across both is as good: of
+    # the upright ones, since a station looks to the other side without being turned over.
+    if cosine < 0 and sine < 1e-8:
+        upright = np.eye(3)[2 - np.argmin(abs(old[::-1]))]
+        axis = upright - upright @ old * old
+        return np.asarray(matrix_from_rotation_vector(np.pi * axis / np.linalg.norm(axis)))
+    if sine == 0:
+        return np.eye(3)
+    return np.asarray(matrix_from_rotation_vector(axis / sine * np.arctan2(sine, cosine)))
+
+
 def _larger(precision_a: Precision, precision_b: Precision) -> Precision:
     """The larger σ of every unknown, and of two covariances that of the larger trace."""
     is_first_larger = lambda a, b: np.trace(a, axis1=1, axis2=2) >= np.trace(b, axis1=1, axis2=2)
@@ -445,7 +455,7 @@ def _selection() -> Section:
 def _ratio(
     sigma_before: Float[AnyArray, "points 3"], sigma_after: Float[AnyArray, "points 3"]
 ) -> Float[np.ndarray, " points"]:
-    """Ratio of the means of σ² of points."""
+    """Ratio of the σ of points after and before, RMS over their axes; 1 where one of them is 0."""
     a, b = (np.sqrt(np.mean(s**2, 1)) for s in (sigma_before, sigma_after))
     return np.where((a > 0) & (b > 0), b / np.where(a > 0, a, 1.0), 1.0)
 

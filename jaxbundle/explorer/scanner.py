@@ -39,6 +39,7 @@ from jaxbundle.explorer.page import (
     draw_tools,
     make_page,
     place,
+    with_value,
 )
 from jaxbundle.explorer.pictures import (
     GroundFrame,
@@ -100,7 +101,7 @@ from jaxbundle.report.page import UNKNOWN, Origin, Page, Section
 from jaxbundle.report.page.markup import paragraph
 from jaxbundle.types import not_none
 
-# Ends of the keys of values that are not negative: of σ, and of walks; the height of an orbit.
+# Ends of the keys of σ and of random walks, which may be 0 but not negative.
 POSITIVE_KEYS = ("white", "walk")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 
@@ -380,7 +381,7 @@ class FlightView:
         """Controls, the ground, the error map, the table; a live page asks for them itself, since
         the first answer compiles programs."""
         values = self.values(given)
-        controls = [_with_value(control, values[control.key]) for control in self.controls]
+        controls = [with_value(control, values[control.key]) for control in self.controls]
         image = self.image
         if self.flight is not None:
             reference = "the true trajectory of the flight"
@@ -566,8 +567,13 @@ class FlightView:
 def _surface_at(height: float, earth: Ellipsoid | None) -> GroundSurface:
     if earth is None:
         return Plane(level=height)
-    if height == 0 or earth.a != earth.b:
+    if height == 0:
         return Ground(earth)
+    if earth.a != earth.b:
+        raise InputError(
+            f"the height of the ground is {height:g}: above an ellipsoid with three different axes "
+            "there are no heights; expected 0"
+        )
     return Height(level=height, earth=earth)
 
 
@@ -610,13 +616,6 @@ def _attitude_with(attitude: AttitudeTable, method: str) -> AttitudeTable:
         extrapolate=table.extrapolate,
         reference=attitude.reference,
     )
-
-
-def _with_value(control: Control, value: Any) -> Control:
-    if isinstance(control, Number) and control.low is not None and control.high is not None:
-        low, high = min(control.low, value), max(control.high, value)
-        return control._replace(value=value, low=low, high=high)
-    return control._replace(value=value)
 
 
 def _kernel(values: Mapping[str, Any]) -> Resampling:

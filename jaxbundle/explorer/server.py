@@ -30,7 +30,8 @@ from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.report.page import write
 
 HOST = "127.0.0.1"
-# Maximum bytes of the body of a request: about 2000 stations of a network, moved.
+# Maximum bytes of the body of a request: about 2000 stations of a network, moved, each an id and
+# six numbers of up to 18 characters.
 MOST_BYTES = 256 * 1024
 # Seconds in which a request must arrive, all of it: a sender that trickles bytes must not hold a
 # connection.

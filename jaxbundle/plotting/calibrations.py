@@ -66,7 +66,7 @@ def difference_map(
     is_known = np.isfinite(comparison.length[every_second])
     x, y = (grid[every_second][is_known] for grid in np.meshgrid(comparison.x, comparison.y))
     u, v = np.moveaxis(factor * comparison.difference[every_second][is_known], -1, 0)
-    key = round_number(factor * comparison.largest) or 1.0
+    key = round_number(factor * comparison.largest)
     arrows = ax.quiver(
         x, y, u, v, angles="xy", color="white", scale=12 * key, scale_units="width", width=0.002
     )

@@ -101,7 +101,8 @@ def distortion_at(
     """Symmetric radial distortion and decentring of a camera model.
 
     **Arguments:** `parameters` in the model's order; `radius` [radii] from the principal point in
-    the measured image; `azimuths`: number of directions over which harmonics are taken.
+    the measured image; `azimuths`: number of directions over which harmonics are taken: of twelve,
+    harmonics up to the tenth leave mean and one turn unchanged.
 
     **Returns:** both [2, radii], in the model's unit, rounding noise set to 0, and their
     derivatives by all parameters [2, radii, parameters].

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from jaxbundle.plotting.style import round_number
 
@@ -170,10 +171,11 @@ def _circle(corners: int) -> Float[np.ndarray, "2 corners"]:
 
 
 def median_neighbour(places: Float[np.ndarray, "n d"], max_sample: int = 400) -> float:
-    """The median distance to the nearest neighbour, from a sample; infinite for a single place."""
-    if len(places) < 2:
+    """The median distance to the nearest other place, of a sample of at most `max_sample`;
+    infinite if there is one place only."""
+    different_places = np.unique(places, axis=0)
+    if len(different_places) < 2:
         return np.inf
-    sample = places[:: max(1, len(places) // max_sample)]
-    distances = np.linalg.norm(sample[:, None] - places[None], axis=2)
-    distances[distances == 0] = np.inf
-    return float(np.median(distances.min(1)))
+    sample = places[:: -(-len(places) // max_sample)]
+    distances, _ = KDTree(different_places).query(sample, 2)  # the first is the place itself
+    return float(np.median(distances[:, 1]))

@@ -132,7 +132,7 @@ def draw_tracks(
 ) -> list[Path]:
     """Write the tracks of at most `max_images` photographs, evenly chosen.
 
-    **Arguments:** `read(image)`: its grey values, of any size.
+    **Arguments:** `read_photograph(image)`: its grey values, of any size.
     """
     images = adjustment.network.images.id
     chosen_rows = np.unique(

@@ -51,7 +51,7 @@ def residual_vectors(
     low = np.minimum(low, xy.min(0, initial=np.inf))
     high = np.maximum(high, xy.max(0, initial=-np.inf))
     diagonal = float(np.hypot(*(high - low)))
-    longest = np.fmax.reduce(np.hypot(*v.T), initial=0.0)  # Removed points have no arrow.
+    longest = np.fmax.reduce(np.hypot(*v.T), initial=0.0)  # v of a removed coordinate is NaN
     factor = round_number(0.1 * diagonal / longest) if longest > 0 else 1.0
     large = (np.abs(tau) > large_tau).any(1)
     scale, unit = micrometres(model.unit)

@@ -51,9 +51,12 @@ def dsm_relief(dsm: Dsm, ax: Axes | None = None) -> Axes:
     from matplotlib import colormaps
 
     ax = axes(ax, (7.0, 6.0))
-    Z = np.where(np.isfinite(dsm.height), dsm.height, np.nanmean(dsm.height))
-    slope_down, slope_right = np.gradient(Z, dsm.size) if min(Z.shape) > 1 else (0 * Z, 0 * Z)
+    Z = np.where(np.isfinite(dsm.height), dsm.height, np.nan)
+    slopes = np.gradient(Z, dsm.size) if min(Z.shape) > 1 else (0 * Z, 0 * Z)
+    # Beside a cell without height the slope is not known: drawn as level.
+    slope_down, slope_right = (np.nan_to_num(slope) for slope in slopes)
     # From the upper left, as in maps: under light from below, valleys look like ridges.
+    # In full shadow a third of the colour remains, so that heights can be told there.
     azimuth, elevation, ambient = np.radians(315.0), np.radians(45.0), 0.35
     # The normal (−∂Z/∂x, −∂Z/∂y, 1), y against the rows.
     light = np.array(
@@ -66,6 +69,7 @@ def dsm_relief(dsm: Dsm, ax: Axes | None = None) -> Axes:
     shade = (-slope_right * light[0] + slope_down * light[1] + light[2]) / np.sqrt(
         1 + slope_right**2 + slope_down**2
     )
+    # Colours without the ends of the map: white is that of cells without height.
     low, high = np.nanpercentile(dsm.height, [1, 99])
     colour = colormaps["terrain"](np.clip((Z - low) / max(high - low, 1e-9), 0, 1) * 0.8 + 0.1)
     colour[..., :3] *= (ambient + (1 - ambient) * np.clip(shade, 0, 1))[..., None]

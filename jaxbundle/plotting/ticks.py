@@ -27,6 +27,7 @@ def label_ticks(ticks: Sequence[float] | Float[np.ndarray, " n"]) -> tuple[float
         return 0.0, name_ticks(values)
     span, largest = float(values[-1] - values[0]), float(np.abs(values).max())
     digits = math.log10(max(largest, 1.0)) + max(_places(values), 0)
+    # Within ten spans of 0 an offset would save one digit, and is not worth its label.
     if largest <= 10 * span or digits < TICK_DIGITS:
         return 0.0, name_ticks(values)
     # The smallest power of ten not below the span, by a logarithm that rounding may raise.
@@ -43,7 +44,7 @@ def name_ticks(values: Float[np.ndarray, " n"]) -> list[str]:
     # + 0.0: no minus before a zero
     # a sum of steps that passes 0 misses it by rounding
     values = np.where(np.abs(values) < 1e-6 * (values[1] - values[0]), 0.0, values) + 0.0
-    if 1e-4 <= largest < 10.0**TICK_DIGITS:
+    if 1e-4 <= largest < 10.0**TICK_DIGITS:  # as Python's format `g`, which needs no exponent there
         return [f"{value:.{max(places, 0)}f}" for value in values]
     exponent = math.floor(math.log10(largest) + 1e-9)  # one for all ticks of an axis
     decimals = max(exponent + places, 0)

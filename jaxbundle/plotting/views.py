@@ -99,11 +99,11 @@ def network_plan(adjustment: "Adjustment", ax: "Axes | None" = None) -> "Axes":
     name = f"{adjustment.network.name}: seen along Z"
     title(ax, name, selection and f"error ellipses {selection}")
     _legend_below(ax)
-    viewing = centres - pyramids[:, 1:].mean(1)
+    backward = centres - pyramids[:, 1:].mean(1)
     upper_right = np.full((len(points["id"]), 2), 0.7)
     ids = []
     if len(centres) <= MAX_LABELS // 2:
-        ids.append((adjustment.images["id"], centres, INK, viewing[:, :2] / size))
+        ids.append((adjustment.images["id"], centres, INK, backward[:, :2] / size))
     if len(points["id"]) <= MAX_LABELS:
         ids.append((points["id"], points["xyz"], BLUE, upper_right))
     # Beyond some thousands of dots an id finds no room in any case.
@@ -173,14 +173,14 @@ def network_perspective(adjustment: "Adjustment", ax: "Axes3D | None" = None) ->
                 **_behind_ellipsoids(role, len(points["id"]), ellipses),
             )
     if ellipses.total:
-        pyramids_drawn = Poly3DCollection(
+        sections = Poly3DCollection(
             list(principal_sections(adjustment, ellipses)),
             facecolors=to_rgba(BLUE, 0.1),
             edgecolors=to_rgba(BLUE, 0.8),
             linewidths=0.6,
             label=f"error ellipsoids (1σ, {PROBABILITY[3]}) {ellipses.exaggeration}",
         )
-        view.add_collection3d(pyramids_drawn)
+        view.add_collection3d(sections)
     if len(ellipses.wide):
         places = adjustment.point_values[ellipses.wide]
         view.scatter(*places.T, depthshade=False, **TOO_WIDE)
@@ -226,9 +226,12 @@ def camera_pyramids(adjustment: "Adjustment", size: float) -> np.ndarray:
         corners[cameras_of_model] = _corner_rays(model, p, frames[cameras_of_model])
     # If the distortion turns back inside the frame there is no ray: an approximate corner instead.
     is_missing = ~np.all(np.isfinite(corners), axis=2)
-    plain = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
-    corners = np.where(is_missing[:, :, None], plain, corners)
-    # Corners at one depth, of a lens far from a hemisphere, make a plane rectangle.
+    # A depth of 1.4 to a half side of 1: a field of 71°, as of a wide-angle lens.
+    approximate = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
+    approximate /= np.linalg.norm(approximate, axis=1)[:, None]  # as long as the other rays
+    corners = np.where(is_missing[:, :, None], approximate, corners)
+    # Corners at one depth, of a lens far from a hemisphere, make a plane rectangle. Up to 78° off
+    # the axis, where the cosine is 0.2: beyond, one depth would draw an edge out to five times.
     flat = np.all(corners[:, :, 2] < -0.2, axis=1)
     corners[flat] /= -corners[flat][:, :, 2:]
     corners /= np.linalg.norm(corners, axis=2).mean(1)[:, None, None]

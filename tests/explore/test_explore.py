@@ -33,13 +33,27 @@ from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
 from jaxbundle.explorer import server as server_module
 from jaxbundle.explorer.camera import CameraView
-from jaxbundle.explorer.network import NetworkView
-from jaxbundle.explorer.page import Number, draw_controls, draw_tools, make_page, place
-from jaxbundle.explorer.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, FlightView
+from jaxbundle.explorer.network import NetworkView, _smallest_turn
+from jaxbundle.explorer.page import (
+    Number,
+    draw_controls,
+    draw_tools,
+    make_page,
+    place,
+    with_value,
+)
+from jaxbundle.explorer.scanner import (
+    FLIGHT_FILE,
+    PICTURE_FILE,
+    TABLE_FILE,
+    FlightView,
+    _surface_at,
+)
 from jaxbundle.explorer.server import MOST_BYTES, Server, page_file
 from jaxbundle.explorer.tracks import ENDS, GEODETIC, LOCAL, ORBIT, STRAIGHT, USUAL, choose_track
 from jaxbundle.explorer.view import File, check_keys, number
 from jaxbundle.explorer.widget import reply, show
+from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.network.tables import Camera
@@ -342,6 +356,15 @@ def test_a_station_turns_to_its_points(network, convergent4):
     assert_allclose(unit(move.M @ (middle - move.centre)), before, atol=1e-12)
 
 
+@pytest.mark.parametrize("old", [(0, 0, -1), (1, 0, 0), (0.6, 0, 0.8), (0.48, 0.6, 0.64)])
+def test_a_station_on_the_other_side_of_its_points_looks_back(old):
+    old = np.array(old)
+    for new in (-old, old, np.array([0.0, 1.0, 0.0])):
+        turn = _smallest_turn(old, new)
+        assert_allclose(turn @ old, new, atol=1e-12)
+        assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+
+
 @pytest.mark.parametrize("given, words", [
     ({"moves": [1]}, "values by station"), ({"moves": {"nowhere": [0] * 6}}, "no image 'nowhere'"),
     ({"moves": {"ID": [0] * 5}}, "six numbers"), ({"moves": {"ID": [None] * 6}}, "six numbers"),
@@ -379,6 +402,13 @@ def test_the_grid_is_the_image_of_its_rays_by_the_model():
     given = view.answer({})
     assert given["rms"] == 0 and found["largest"] > found["rms"] > 1
     assert "difference/σ" in found["parts"]["numbers"] and ">100<" in found["parts"]["numbers"]
+
+
+def test_a_slider_reaches_a_value_beyond_its_ends():
+    control = Number("k1", "k1", 0.0, "", -1.0, 1.0)
+    assert with_value(control, 2.5) == Number("k1", "k1", 2.5, "", -1.0, 2.5)
+    page = str(CameraView(CAMERA).page({"k1": 77.0}, live=False).sections)
+    assert 'max="77.0" value="77.0"' in page
 
 
 def test_the_camera_file_has_the_values_of_the_sliders(tmp_path):
@@ -525,6 +555,12 @@ def test_an_image_that_was_read_is_its_own_reference(flight):
     keys = {control.key for control in view.controls}
     assert "attitude_rate" not in keys and "aberration" not in keys  # no Earth
     assert view.answer({"pitch": 0.1})["rms"] > 800 * np.radians(0.1)
+
+
+def test_there_is_no_height_above_an_ellipsoid_of_three_axes():
+    assert _surface_at(0.0, Ellipsoid(3.0, 2.0, 1.0)).earth.b == 2
+    with pytest.raises(InputError, match="the height of the ground is 100: .*three different axes"):
+        _surface_at(100.0, Ellipsoid(3.0, 2.0, 1.0))
 
 
 @pytest.mark.parametrize("given, words", [

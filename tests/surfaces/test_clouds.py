@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import rasterio
+from numpy.testing import assert_allclose
 from surface_scenes import hills, photographs, two_shapes
 
 from jaxbundle import plotting
@@ -344,6 +345,12 @@ def test_pictures_show_all_points_and_cells(plane):
     rising = dataclasses.replace(dsm, height=-dsm.height)
     lit = plotting.dsm_relief(rising).images[0].get_array()[..., :3]
     assert lit.mean() != picture.get_array()[..., :3].mean()
+    # two level steps, one with a hole: beside it the ground is as level as elsewhere
+    height = np.repeat([[0.0] * 6 + [10.0] * 6], 9, axis=0)
+    height[4, 2] = np.nan
+    steps = Dsm(height, 0 * height, np.ones((9, 12), int), 0.0, 9.0, 1.0)
+    colours = plotting.dsm_relief(steps).images[0].get_array()[:, :5][np.isfinite(height[:, :5])]
+    assert_allclose(colours, np.broadcast_to(colours[0], colours.shape))
     plt.close("all")
 
 

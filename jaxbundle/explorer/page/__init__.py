@@ -45,6 +45,14 @@ class Switch(NamedTuple):
 Control = Number | Choice | Switch
 
 
+def with_value(control: Control, value: Any) -> Control:
+    """A control with another value, which its slider reaches."""
+    if isinstance(control, Number) and control.low is not None and control.high is not None:
+        low, high = min(control.low, value), max(control.high, value)
+        return control._replace(value=value, low=low, high=high)
+    return control._replace(value=value)
+
+
 def draw_controls(controls: Iterable[Control], live: bool) -> str:
     """A column of controls; in a copy they only show their values."""
     dead = "" if live else " disabled"

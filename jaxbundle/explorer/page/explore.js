@@ -73,7 +73,7 @@ async function send(action, given) {
   if (framed) return sendThroughWidget(action, given);
   const response = await fetch(action, {
     method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(given),
-  });
+  }).catch(() => { throw new Error("the program has ended"); });
   if (response.ok) return response;
   const { error } = await response.json().catch(() => ({ error: response.statusText }));
   throw new Error(error);
@@ -90,7 +90,7 @@ async function ask() {
   try {
     putAnswer(await (await send("answer", explorer.collect())).json());
   } catch (error) {
-    words = error.message === "Failed to fetch" ? "the program has ended" : error.message;
+    words = error.message;
   }
   showWork(false);
   say(words);

@@ -79,7 +79,7 @@ class Moves {
     const { observations } = this.tables;
     const names = RAY.filter(name => observations.has(name)), rows = [];
     const fits = (name, wanted, row) => wanted === undefined || observations.cell(name, row) === wanted;
-    for (let row = 0; row < observations.length && rows.length < MOST_RAYS_LISTED; row++) {
+    for (let row = 0; row < observations.length; row++) {
       if (fits("image", image, row) && fits("point", point, row)) rows.push(row);
     }
     const cells = row => names.map(name => make("td", { textContent: observations.cell(name, row) }));
@@ -87,10 +87,12 @@ class Moves {
       make("th", { scope: "col", textContent: observations.columns[name].label }));
     const title = [["point", point], ["image", image]].filter(([, id]) => id !== undefined)
       .map(([noun, id]) => `${noun} ${id}`).join(" in ");
+    const listed = rows.slice(0, MOST_RAYS_LISTED);
+    const part = rows.length > listed.length ? `, the first ${listed.length} of them listed` : "";
     this.said.replaceChildren(
-      make("p", {}, `${title}: ${rows.length} observations. ${this.describe(image, point)}`),
+      make("p", {}, `${title}: ${rows.length} observations${part}. ${this.describe(image, point)}`),
       make("table", {}, make("thead", {}, make("tr", {}, ...head)),
-        make("tbody", {}, ...rows.map(row => make("tr", {}, ...cells(row))))));
+        make("tbody", {}, ...listed.map(row => make("tr", {}, ...cells(row))))));
   }
 
   describe(image, point) {
@@ -112,6 +114,8 @@ class Moves {
     const { images } = this.tables, id = this.select.value, row = images.row(id);
     const values = this.moved[id] ?? POSE.map(name => images.numbers(name)[row]);
     this.fields.forEach((field, i) => {
+      // A station that is turned to its points has the angles that this needs.
+      field.disabled = !explored.live || (i > 2 && this.aim.checked);
       field.value = values[i] === null ? "" : Number(values[i].toFixed(images.columns[POSE[i]].places));
     });
   }
