@@ -34,8 +34,6 @@ from jaxbundle.surfaces.raster_cells import RasterCells, open_cells
 # Errors by name, such as {"vertical": 0.2}.
 Errors = Mapping[str, float]
 
-# Regions in a report: about a screen.
-MOST_REGIONS = 20
 NOTHING_SHARED = (
     ": those of the orientations are missing (--before-orientation, --before-error), and σ of "
     "volumes and of slow changes are too small"
@@ -83,13 +81,14 @@ class ChangeResult(TableMethods):
             f"{count(figures['shared_errors'], 'error')} common to cells"
             + ("" if figures["shared_errors"] else NOTHING_SHARED),
         ]
-        for region in (self.change.total, *self.change.regions[:MOST_REGIONS]):
+        most = 20  # about a screen
+        for region in (self.change.total, *self.change.regions[:most]):
             name = "all cells" if region.label == 0 else f"region {region.label}"
             lines.append(
                 f"{name}: {region.cells} cells, mean {region.mean:.4g}, volume "
                 f"{region.volume:.6g}, σ {region.sigma:.3g}"
             )
-        number_of_others = len(self.change.regions) - MOST_REGIONS
+        number_of_others = len(self.change.regions) - most
         if number_of_others > 0:
             lines.append(f"… and {count(number_of_others, 'more region')}: all are in the JSON")
         return "\n".join([*lines, *(f"warning: {words}" for words in self.warnings)])

@@ -24,10 +24,6 @@ from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, not_none
 
-# Solutions with S and the cells of terrain heights at those before. S settles in two or three; a
-# point that goes to and fro between two cells never does.
-ROUNDS = 10
-
 
 class SharedUnknowns(eqx.Module):
     """The changes of the shared unknowns, as a function of the tables. `places`: by table,
@@ -162,9 +158,12 @@ class RefinementInspection:
 
 
 def adjust(
-    declared: DeclaredRefinement, snooping: str, significance: float
+    declared: DeclaredRefinement, snooping: str, significance: float, max_rounds: int = 10
 ) -> RefinementInspection:
     """Solve, optionally remove blunders, and inspect the solution.
+
+    `max_rounds`: of solutions with S and the cells of terrain heights at the one before. S settles
+    in two or three; a point that goes to and fro between two cells never does.
 
     **Raises:** `NotSolvedError` with the undetermined unknowns."""
     steps, unsettled = 0, 0.0
@@ -175,7 +174,7 @@ def adjust(
         # S = −(∂g/∂(l, u))⁻¹ (`kinds`) is held during a solution: its own derivatives are second
         # ones of the trajectory, and v needs them nowhere. It is right when it is that of the
         # solution, within 1e-9 of itself; the second solution starts at the first, and is near it.
-        for _ in range(ROUNDS):
+        for _ in range(max_rounds):
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
             problem, change = declared.rescale(problem, values)

@@ -32,7 +32,7 @@ from jaxbundle.refinement.check_points import RefinementCheckPoints, intersect
 from jaxbundle.refinement.declare import declare
 from jaxbundle.refinement.freedom import UnknownName, change_of
 from jaxbundle.refinement.inputs import IMAGE, SENSOR, RefinementInput, gather
-from jaxbundle.refinement.inspection import ROUNDS, RefinementInspection, adjust
+from jaxbundle.refinement.inspection import RefinementInspection, adjust
 from jaxbundle.refinement.refined_image import refined_image
 from jaxbundle.refinement.report import report as describe_refinement
 from jaxbundle.refinement.report import to_json
@@ -386,7 +386,7 @@ def _unsettled(inspection: RefinementInspection) -> Iterator[str]:
     """That linearised observations still change, as a warning."""
     if inspection.unsettled:
         yield (
-            f"after {ROUNDS} rounds the heights of the terrain model still change by "
+            "in the last round the heights of the terrain model still changed by "
             f"{inspection.unsettled:.2g} σ, or the scales of image points by as much of "
             "themselves; look for tie points at steps of the terrain, or leave it out"
         )
