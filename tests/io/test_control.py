@@ -80,29 +80,35 @@ def test_control_in_mm_for_start_values_in_m_is_said(tmp_path, scale, said):
     assert said in told and "control.csv" in told
 
 
-@pytest.mark.parametrize("frame", FRAME)
-def test_what_else_is_observed_in_the_frame_of_the_input(tmp_path, frame):
-    """σ of check points that the table does not have turn with the frame; antennas are left out."""
+@pytest.mark.parametrize("frame", [*FRAME, "a little off"])
+@pytest.mark.parametrize("in_control", [False, True])
+def test_what_else_is_observed_in_the_frame_of_the_input(tmp_path, frame, in_control):
+    """σ of check points that the table does not have turn with the frame; antennas are left out
+    unless they are in the frame of the control, or the start values only a little off, as those by
+    GNSS are."""
+    to_control = FRAME.get(frame, lambda X: X + 0.05 * np.ptp(POINTS, axis=0).max())
     input, _ = project(tmp_path)
     net = read_network(input)
     points = net.points
     roles = tuple("check" if k == 5 else role for k, role in enumerate(points.role))
     sigma = np.full_like(points.sigma, np.nan)
     sigma[5] = 0.01, 0.02, 0.03
-    columns = {"image": net.images.id, **dict(zip("XYZ", POSITION.T))}
+    antennas = to_control(POSITION) if in_control else POSITION
+    columns = {"image": net.images.id, **dict(zip("XYZ", antennas.T))}
     columns |= {f"s{axis}": [0.1] * 3 for axis in "XYZ"}
     gps = Antennas.from_columns(Columns(columns, Source("gps")), {}, 1.0)
     points = dataclasses.replace(points, role=roles, sigma=sigma)
     net = with_control(
         net.replace(points=points, further=(gps,)),
-        read_control(table(tmp_path, FRAME[frame](POINTS))),
+        read_control(table(tmp_path, to_control(POINTS))),
     )
     A = SCALE * TURN if frame == "another" else np.eye(3)
     covariance = A @ np.diag(sigma[5] ** 2) @ A.T
     assert net.points.role[5] == "check"
+    assert_allclose(net.images.position, to_control(POSITION), rtol=1e-12, atol=1e-9)
     assert_allclose(net.points.sigma[5], np.sqrt(np.diag(covariance)), rtol=1e-9)
     told = any("3 observed positions of antennas" in line for line in net.warnings)
-    assert told == (frame == "another") == (not net.further)
+    assert told == (frame == "another" and not in_control) == (not net.further)
 
 
 def test_points_without_coordinates_are_intersected_to_find_the_frame(tmp_path):

@@ -8,7 +8,7 @@ a role its points are control points, those without σ held.
 The table replaces the control of the input: control and fixed points missing from the table
 become tie points. If the start values of the input are in another frame (PhotoModeler shifts
 them), a similarity through the common points transforms images and points into that of the
-table; observed positions of antennas are then left out.
+table; observed positions of antennas that are not in it are then left out.
 """
 
 import csv
@@ -29,6 +29,7 @@ from jaxbundle.io.text.rows import is_number
 from jaxbundle.network.build import POINT_ERRORS, POINT_SIGMAS
 from jaxbundle.network.columns import Columns, count, did_you_mean, list_some
 from jaxbundle.network.kinds import Antennas
+from jaxbundle.network.kinds.base import rows_of
 from jaxbundle.network.rules import AXES, check_choice, check_unique
 from jaxbundle.network.tables import ROLES, Images, Network, Points, Source
 from jaxbundle.network.unit_mistakes import name_degrees
@@ -52,7 +53,8 @@ class ControlFrameSettings:
 
     `max_misfit`: median residual of the similarity between both, relative to the RMS distance of
     the control from its mean, above which it is none: of points in random order it is about 1, of
-    start values that are good for anything some hundredths.
+    start values that are good for anything some hundredths. Images so far from their
+    antennas, but nearer before the similarity, leave them in another frame than the control.
 
     `thousand_tolerance`: how near to 1000 or 1/1000, relative, the scale of the similarity must be
     for a warning about mm and m: a scale in an arbitrary unit is within 1 % by chance once in some
@@ -319,23 +321,30 @@ def _transform_into_frame(
     position = points.position @ A.T + t
     # Of check points; NaN and infinity, of an axis, become those of the point.
     sigma = np.sqrt(np.square(points.sigma) @ np.square(A).T)
-    further = tuple(kind for kind in network.further if not isinstance(kind, Antennas))
-    if left_out := sum(len(k.image) for k in network.further if isinstance(k, Antennas)):
-        network = network.warn(
-            f"{count(left_out, 'observed position')} of antennas (GNSS) of the input are left out: "
-            f"they are in its frame, and that of the control of {control.source.name} is another"
-        )
+    new_images = Images(
+        images.id,
+        images.camera,
+        images.position @ A.T + t,
+        angles_of(M),
+        images.sigma,
+        images.source,
+    )
+    further = []
+    for kind in network.further:
+        if isinstance(kind, Antennas) and _stay_behind(
+            kind, images, new_images, target, settings.max_misfit
+        ):
+            network = network.warn(
+                f"left out {count(len(kind.image), 'observed position')} of antennas (GNSS) of the "
+                f"input: they are in its frame, and the control of {control.source.name} is in "
+                "another"
+            )
+        else:
+            further.append(kind)
     return network.replace(
-        images=Images(
-            images.id,
-            images.camera,
-            images.position @ A.T + t,
-            angles_of(M),
-            images.sigma,
-            images.source,
-        ),
+        images=new_images,
         points=dataclasses.replace(points, position=position, sigma=sigma),
-        further=further,
+        further=tuple(further),
     ).note(
         "the start values of the input are in another frame than the control: a similarity by "
         f"{count(len(source), 'point')} was applied (scale {scale:.6g})"
@@ -347,7 +356,7 @@ def _check_similarity(
 ) -> None:
     """Refuse control that deviates from the similarity by more than `max_misfit` of its spread: the
     network would not be in its frame."""
-    rms_radius = np.sqrt(np.square(control.position - control.position.mean(0)).sum(1).mean())
+    rms_radius = _rms_radius(control.position)
     if np.median(deviations) > max_misfit * rms_radius:
         largest = (f"{control.id[k]!r} by {deviations[k]:.3g}" for k in np.argsort(-deviations))
         raise InputError(
@@ -357,6 +366,30 @@ def _check_similarity(
             f"{list_some(largest, 3, str)}; check names and units of the table, or leave out the "
             "start values of the input"
         )
+
+
+def _stay_behind(
+    antennas: Antennas,
+    images: Images,
+    new_images: Images,
+    control: Float[np.ndarray, "n 3"],
+    max_misfit: float,
+) -> bool:
+    """Whether antennas are nearer to the images than to those transformed, and far from these: in
+    the frame of the input; far: by more than `max_misfit` of the spread of the antennas or of the
+    control, the larger one."""
+    limit = max_misfit * max(_rms_radius(antennas.position), _rms_radius(control))
+    rows = rows_of(antennas.image, images)
+    old, new = (
+        np.nanmedian(np.linalg.norm(antennas.position - table.position[rows], axis=1))
+        for table in (images, new_images)
+    )
+    return bool(old < new > limit)
+
+
+def _rms_radius(X: Float[np.ndarray, "n 3"]) -> float:
+    """The RMS distance of points from their mean."""
+    return float(np.sqrt(np.square(X - X.mean(0)).sum(1).mean()))
 
 
 def _intersect_points(
