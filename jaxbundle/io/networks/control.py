@@ -320,7 +320,8 @@ def _transform_into_frame(
     M = matrices_of(images.angles) @ (A / scale).T
     position = points.position @ A.T + t
     # Of check points; NaN and infinity, of an axis, become those of the point.
-    sigma = np.sqrt(np.square(points.sigma) @ np.square(A).T)
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.square(points.sigma) @ np.square(A).T)
     new_images = Images(
         images.id,
         images.camera,
