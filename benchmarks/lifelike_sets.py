@@ -9,7 +9,7 @@
 | `room` | a room with bare walls, pictures, identical books; some turned at one place |
 | `courtyard` | all around inside a courtyard, opposite wings with identical windows and roofs |
 | `drone` | from above, in strips with alternating headings; houses, trees, cars |
-| `coast` | the same over a shore: waves that differ, woods whose leaves do, one photograph of the sea alone |
+| `coast` | the same over a shore: waves and leaves that differ, one photograph of the sea alone |
 
 Every photograph has its own exposure, white balance and tone curve, vignetting and blur towards the
 edges, photon noise, sharpening halos, JPEG of quality 85. People and a car are at different places

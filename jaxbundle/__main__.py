@@ -1,7 +1,7 @@
 """`jaxbundle` and `python -m jaxbundle`: the command line.
 
 One BLAS thread, unless the environment says otherwise: threads are slow on small matrices. OpenCV
-reports errors only. The libraries read these variables on import.
+logs fatal errors only. The libraries read these variables on import.
 """
 
 import gc

@@ -4,8 +4,7 @@
 |---|---|
 | importing the package | changes nothing |
 | the user, once; the command line | `enable_x64()`, before the first JAX computation |
-| functions that return coordinates, orientations, calibrations | `require_x64()`: an error without
-|
+| functions that return coordinates, orientations, calibrations | `require_x64()`: an error if not |
 | NumPy in, NumPy out: reading, writing and converting files and cameras | `with local_x64():` |
 | formulas of one point, ray or exchange | nothing: they compute in the type of their arguments |
 

@@ -17,7 +17,7 @@ def import_on_use(package: dict, homes: dict[str, tuple[str, ...]]) -> tuple:
                 if error.name != room:
                     raise
         if name not in module:
-            from difflib import get_close_matches  # here: interrupts are handled before it
+            from difflib import get_close_matches  # not above: interrupts are handled by now
 
             title, close = package["__name__"], []
             if not name.startswith("_"):

@@ -182,7 +182,8 @@ def test_what_is_refused(tmp_path, flight, run):
           "EPSG:4326"], ["local frame"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--resampling",
           "best"], ["best", "bilinear"]),
-        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path], ["is a folder", "give the name of a file"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path],
+         ["is a folder", "give the name of a file"]),
     ]:  # fmt: skip
         status, said, err = run(*arguments)
         assert status == 2 and len(err.splitlines()) == 1
