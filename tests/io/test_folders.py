@@ -311,7 +311,7 @@ def test_tables_of_line_scanners_do_not_replace_their_input(tmp_path):
     ):
         before = output.read_text()
         done = CliRunner().invoke(app, ["pushbroom", *command.split(), str(output)])
-        assert f"{output} is part of the input and would be overwritten" in str(done.exception)
+        assert f"{output}: is part of the input and would be overwritten" in str(done.exception)
         assert output.read_text() == before
 
 

@@ -212,11 +212,16 @@ def test_frames_of_images_must_be_one(folder, scene, tmp_path):
 
     from jaxbundle.io.scanner.writing import write_scanner_image
 
-    write_scanner_image(tmp_path, "S", satellite(), None)
+    image = satellite()
+    with pytest.raises(InputError, match="S: attitudes against the orbit need an Earth"):
+        write_scanner_image(tmp_path, "S", image, None)
+    attitude = dataclasses.replace(image.trajectory.attitude, reference="earth")
+    local = dataclasses.replace(image.trajectory, attitude=attitude)
+    write_scanner_image(tmp_path, "S", dataclasses.replace(image, trajectory=local), None)
     change(folder, "[unknowns]", 'S = "S.toml"\n[unknowns]\nattitude = "free"')
     with pytest.raises(InputError, match="'A' and 'S' have different ellipsoids or frames"):
         read_refinement(folder / "refine.toml")
-    write_scanner_image(tmp_path, "S", satellite(), WGS84)
+    write_scanner_image(tmp_path, "S", image, WGS84)
     file = read_refinement(folder / "refine.toml")
     assert file.images[3].freedom == dataclasses.replace(
         Freedom(), attitude=(np.inf,) * 3, position=HELD

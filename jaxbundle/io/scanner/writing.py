@@ -43,8 +43,11 @@ def write_scanner_image(
     `read_scanner` reads the same image. The names of the tables begin with `prefix`, by default
     `NAME_`; angles are in `angle_unit`.
 
-    **Raises:** `InputError` for an image with offsets, for which the file has no place.
+    **Raises:** `InputError` for an image with offsets, for which the file has no place, and for
+    attitudes against the orbit without an Earth.
     """
+    if earth is None and image.trajectory.attitude.reference == "orbit":
+        raise InputError(f"{name}: attitudes against the orbit need an Earth, for its vertical")
     if any(np.any(offset) for offset in jax.tree.leaves(image.offsets)):
         raise InputError(
             f"{name}: the trajectory has offsets, which a scanner file does not contain; apply "
