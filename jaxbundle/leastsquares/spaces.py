@@ -71,7 +71,13 @@ def hold_by_retraction(
     """`Space.hold` where directions are no numbers of the value: the change from `start` to it,
     without that along held directions."""
     without_held = space.retract(start, jnp.where(free > 0, space.difference(value, start), 0.0))
-    return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, without_held)
+
+    def choose(all_free: Array, some_free: Array, none_free: Array) -> Array:
+        # Both ends exactly: a retraction normalises rotations, which changes their last digit.
+        held_in_part = jnp.where(free.max() > 0, some_free, none_free)
+        return jnp.where(free.min() > 0, all_free, held_in_part)
+
+    return jax.tree.map(choose, value, without_held, start)
 
 
 @dataclasses.dataclass(frozen=True)
