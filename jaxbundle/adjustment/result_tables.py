@@ -139,7 +139,8 @@ def units(adjustment: "Adjustment", columns: Sequence[str], name: str) -> dict[s
     if name in ("residuals", "cameras"):
         return {}
     length, angle = adjustment.network.object_unit, adjustment.network.angle_unit
-    unit_of = dict.fromkeys((*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther"), length)
+    lengths = (*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther")
+    unit_of: dict[str, str] = {name: length for name in lengths}
     unit_of |= dict.fromkeys((*EXTERIOR[3:], "su"), angle)
     unit_of |= dict.fromkeys(("rms", "x", "y"), adjustment.image_unit)
 

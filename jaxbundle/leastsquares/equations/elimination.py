@@ -93,7 +93,7 @@ def regularise_diagonal(normal: Normal, ridge: float = 1e-10) -> Normal:
         return B + ridge_of_rows[:, :, None] * jnp.eye(B.shape[1])
 
     diagonal = {name: add(B) for name, B in N.diagonal_blocks.items()}
-    eliminated = None if e is None else add(N.eliminated)
+    eliminated = None if e is None else add(not_none(N.eliminated))
     return Normal(
         normal.plan, dataclasses.replace(N, diagonal_blocks=diagonal, eliminated=eliminated)
     )
