@@ -9,7 +9,6 @@
 | `room` | a room with bare walls, pictures, identical books; some turned at one place |
 | `courtyard` | all around inside a courtyard, opposite wings with identical windows and roofs |
 | `drone` | from above, in strips with alternating headings; houses, trees, cars |
-| `coast` | the same over a shore: waves and leaves that differ, one photograph of the sea alone |
 
 Every photograph has its own exposure, white balance and tone curve, vignetting and blur towards the
 edges, photon noise, sharpening halos, JPEG of quality 85. People and a car are at different places
@@ -409,40 +408,8 @@ def drone(width: int) -> list[Shot]:
     return _shots("n", stages, X0, at, width, focal, roll)
 
 
-def coast(width: int) -> list[Shot]:
-    """A shore from above: waves that are others in every photograph, woods whose leaves are; the
-    last photograph shows the sea alone."""
-    rng = np.random.default_rng(37)
-    high, focal, strips, each = 60.0, 0.75, 3, 5
-    n = strips * each
-    stage = Stage(0.5 * high / (focal * width))
-    ground = lambda X, Y: 1.5 * np.sin(X / 25) * np.cos(Y / 30) + 0.4 * np.sin(X / 6 + Y / 9)
-    stage.add(HeightField(ground, (-150, -130, 150, 15)), 1, side=2048, contrast=0.12, mean=0.4)
-    for k in range(8):
-        (x, y), (a, b) = rng.uniform([-50, -45], [50, -5]), rng.uniform(5, 10, 2)
-        stage.box((x, y, -1), (a, b, rng.uniform(4, 8)), 100 + 7 * k, contrast=0.1,
-                  mean=rng.uniform(0.3, 0.7))  # fmt: skip
-    along, aside = 0.25 * high / focal, 0.3 * 0.75 * high / focal
-    X, Y = np.meshgrid(along * (np.arange(each) - 2), aside * (np.arange(strips) - 1) - 8)
-    X0 = np.c_[X.ravel(), Y.ravel(), np.full(n, high)] + rng.normal(size=(n, 3)) * [1, 1, 0.7]
-    X0 = np.concatenate([X0, [[20.0, 90.0, high]]])
-    at = (X0 + 0.03 * high * rng.normal(size=(n + 1, 3))) * [1, 1, 0]
-    woods = rng.uniform([-55, -40], [-25, 10], (25, 2))
-    stages = []
-    for k in range(n + 1):
-        one = stage.with_others()
-        sea = Rectangle((-300, 15, 0.3), (600, 0, 0), (0, 400, 0))
-        one.add(sea, 900 + k, side=2048, contrast=0.08, mean=0.35)
-        for i, (x, y) in enumerate(woods):
-            one.add(Ellipsoid((x, y, 3), (3, 3, 4)), 2000 + 30 * k + i, contrast=0.15, mean=0.3)
-        stages.append(one)
-    roll = np.where(np.arange(n + 1) // each % 2 == 1, np.pi, 0.0) + 0.03 * rng.normal(size=n + 1)
-    made = _shots("w", stages, X0, at, width, focal, roll)
-    return [*made[:-1], dataclasses.replace(made[-1], part=0)]
-
-
 LIFELIKE: dict[str, Callable[[int], list[Shot]]] = {
-    f.__name__: f for f in (statue, building, room, courtyard, drone, coast)
+    f.__name__: f for f in (statue, building, room, courtyard, drone)
 }
 
 
