@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.adjustment.problem import NetworkProblem, coordinates, is_scale_open
+from jaxbundle.adjustment.problem import NetworkProblem, coordinates, has_open_scale
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.adjustment.unknowns import angles_near
 from jaxbundle.cameras import get_model
@@ -109,7 +109,7 @@ def common_frames(
     if int(orientation.status):
         raise InputError("the points of the similarity are on one line, or at one place")
     G = np.asarray(jax.vmap(helmert_point)(jnp.asarray(Y))).reshape(-1, 7).copy()
-    if not (_scale_is_open(a.problem) or _scale_is_open(b.problem)):
+    if not (has_open_scale(a.problem) or has_open_scale(b.problem)):
         G[:, SCALE] = 0.0
     projection = np.linalg.pinv(G)
     tau = np.array(orientation.tau)
@@ -128,15 +128,6 @@ def common_frames(
 
 
 _move = compile_once(jax.vmap(transform_point, (None, 0)), ())
-
-
-def _scale_is_open(problem: NetworkProblem) -> bool:
-    datum = problem.plan.datum
-    if datum is None:
-        return False
-    return is_scale_open(
-        np.asarray(datum.gauge), problem.network.points.position - np.asarray(problem.origin)
-    )
 
 
 class UnknownsInFrame(eqx.Module):

@@ -58,9 +58,8 @@ def load_adjustment(
     # Everything is computed again from measurements and values: σ0 shows whether both are whole. It
     # agrees to rounding, 1e-12; another version may sum or stop differently, to less than 1e-6. The
     # σ0 of exact data is rounding itself.
-    if not math.isclose(sigma0, stored.sigma0, rel_tol=1e-6, abs_tol=1e-9) and not math.isnan(
-        stored.sigma0
-    ):
+    agrees = math.isclose(sigma0, stored.sigma0, rel_tol=1e-6, abs_tol=1e-9)
+    if not agrees and not math.isnan(stored.sigma0):
         raise InputError(
             f"{path}: its σ0 is {stored.sigma0:.6g}, but its measurements and values give "
             f"{sigma0:.6g}: it is damaged, was saved by another version ({stored.version}), or a "

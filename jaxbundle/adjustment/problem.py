@@ -368,6 +368,15 @@ def is_scale_open(gauge: Float[np.ndarray, "7 defect"], X: Float[np.ndarray, "po
     return bool((displacement[-1] > NEGLIGIBLE_MOTION * displacement.max(0)).any())
 
 
+def has_open_scale(problem: NetworkProblem) -> bool:
+    """Whether nothing gives a network its scale."""
+    datum = problem.plan.datum
+    if datum is None:
+        return False
+    X = problem.network.points.position - np.asarray(problem.origin)
+    return is_scale_open(np.asarray(datum.gauge), X)
+
+
 def shifted_problem(network: Network, like: NetworkProblem, values: Values) -> NetworkProblem:
     """A problem of other points of the network with the orientations and cameras of `values`,
     without priors and datum: for excluded points."""

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.problem import coordinates, is_scale_open
+from jaxbundle.adjustment.problem import coordinates, has_open_scale
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.arguments import at_least_zero, one_of, positive, show
 from jaxbundle.certificates.units import convert
@@ -393,10 +393,8 @@ def length_errors(
         raise InputError(f"expected a result of jaxbundle.adjust, got {show(given)}")
     one_of("rule", rule, RULES)
     calibrated = read_lengths(lengths)
-    problem = adjustment.problem
-    points, datum = problem.network.points, problem.plan.datum
-    about_origin = points.position - np.asarray(problem.origin)
-    if datum is not None and is_scale_open(np.asarray(datum.gauge), about_origin):
+    points = adjustment.problem.network.points
+    if has_open_scale(adjustment.problem):
         raise InputError(
             f"{calibrated.source}: the network has no scale: add a distance or control points, at "
             "least two"

@@ -139,10 +139,16 @@ def reconstruct(
             np.array([id not in checks for id in named_measurements.name], bool)
         )
     unit = settings.unit
-    if framed or control is not None:
-        metres = METRES[unit]
-        scaled = lambda row: {name: metres * row[name] for name in ("value", "sigma")}
-        distances, unit = [{**row, **scaled(row)} for row in distances], "m"
+    if unit != "m" and (framed or control is not None):
+        in_metres = lambda name, value: (
+            float(value) * METRES[unit] if name in ("value", "sigma") else value
+        )
+        distances = [{name: in_metres(name, x) for name, x in row.items()} for row in distances]
+        if distances:
+            notes.append(
+                f"distances in {unit} are converted to metres, in which positions and control are"
+            )
+        unit = "m"
     further_data = FurtherData(
         named_measurements,
         tuple(distances),

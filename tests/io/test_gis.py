@@ -162,7 +162,6 @@ def test_the_command_writes_it_and_refuses_before_the_work(command, tmp_path):
     ):
         told = command("adjust", project, *options)
         assert told.status == 2 and why in told.err and told.err.count("\n") == 1, told.err
-    pytest.importorskip("pyproj")
     for name in ("x.gpkg", "x.geojson"):
         (tmp_path / name).write_text("notes")
         with pytest.raises(InputError, match="or --force to replace it"):

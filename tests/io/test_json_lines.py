@@ -7,6 +7,7 @@ import stat
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 
 from jaxbundle.errors import InputError
@@ -116,7 +117,7 @@ def test_what_is_not_finite_is_null_in_tuples_too():
 
 
 def test_words_that_are_missing_are_null_in_parquet(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
     words = np.array(["a", None, "None"], object)
     write_parquet(tmp_path / "t.parquet", {"word": words})
-    assert parquet.read_table(tmp_path / "t.parquet")["word"].to_pylist() == ["a", None, "None"]
+    found = pyarrow.parquet.read_table(tmp_path / "t.parquet")["word"]
+    assert found.to_pylist() == ["a", None, "None"]

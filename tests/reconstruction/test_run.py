@@ -294,11 +294,13 @@ def test_distances_give_the_result_their_unit_unless_positions_do(
     monkeypatch.setattr(reconstruct, "assign_cameras", lambda *_: Cameras((), (), (), False, ()))
     monkeypatch.setattr(reconstruct, "find_named", lambda *_: (named, None, []))
     monkeypatch.setattr(reconstruct, "find_positions", lambda *_: (found, []))
-    monkeypatch.setattr(_ReconstructionRun, "run", lambda run: run.further)
+    monkeypatch.setattr(_ReconstructionRun, "run", lambda run: run)
     bars = [{"from": "p", "to": "q", "value": 428.0, "sigma": 0.01}]
-    further = reconstruct.reconstruct(
+    run = reconstruct.reconstruct(
         [tmp_path], settings=ReconstructionSettings(unit="mm"), distances=bars
     )
+    further = run.further
+    assert positions == any("in mm are converted to metres" in note for note in run.notes)
     (bar,) = further.distances
     assert bar["value"] == pytest.approx(distance) and further.unit == unit
     assert bar["sigma"] / bar["value"] == pytest.approx(0.01 / 428.0)
