@@ -184,6 +184,11 @@ def test_an_adjustment_keeps_them(tmp_path):
         jaxbundle.load_adjustment(tmp_path / "saved.npz").network,
     ):
         np.testing.assert_array_equal(network_.points.colour, RGB)
+    # A result may have been renamed, as parts of a reconstruction are.
+    renamed = result.with_changes()
+    renamed.network = result.network.replace(name="part 1")
+    for network_of in (jaxbundle.io.adjusted_network, jaxbundle.io.readjustable_network):
+        assert network_of(renamed).name == "part 1"
 
 
 @pytest.mark.parametrize("kind", ["colmap", "colmap-text", "opensfm", "project", "bundler"])

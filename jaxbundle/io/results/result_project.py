@@ -37,7 +37,7 @@ def adjusted_network(adjustment: "Adjustment") -> Network:
     so are points without coordinates: at infinity, or excluded by data snooping.
     """
     problem = adjustment.problem
-    network = problem.network
+    network = problem.network.replace(name=adjustment.network.name)
     values = adjustment.image_values
     images, points, rays = network.images, network.points, network.observations
     eliminated = {(name.id, name.parameter) for name in adjustment.eliminated}
@@ -90,7 +90,7 @@ def readjustable_network(adjustment: "Adjustment") -> Network:
     snooping, points without coordinates and check points are left out.
     """
     problem = adjustment.problem
-    network = problem.network
+    network = problem.network.replace(name=adjustment.network.name)
     images, rays = network.images, network.observations
     values, eliminated = (
         adjustment.image_values,
