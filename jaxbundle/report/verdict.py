@@ -294,7 +294,7 @@ def judge_check_points(
     """
     largest = float(np.fmax.reduce(ratio, initial=np.nan))
     if np.isnan(largest):
-        words = f"{count(number, 'point')}; {rms}; no difference has a σ that it could be tested by"
+        words = f"{count(number, 'point')}; {rms}; none has a σ to judge its difference by"
         return Finding("Check points", DOUBTFUL, words, "check points not tested")
     words = (
         f"{count(number, 'point')}; {rms}; largest difference {significant(largest)} times its "
