@@ -47,7 +47,9 @@ def write_scanner_image(
     attitudes against the orbit without an Earth.
     """
     if earth is None and image.trajectory.attitude.reference == "orbit":
-        raise InputError(f"{name}: attitudes against the orbit need an Earth, which gives the vertical")
+        raise InputError(
+            f"{name}: attitudes against the orbit need an Earth, which gives the vertical"
+        )
     if any(np.any(offset) for offset in jax.tree.leaves(image.offsets)):
         raise InputError(
             f"{name}: the trajectory has offsets, which a scanner file does not contain; apply "
