@@ -84,8 +84,8 @@ def test_observations_that_never_settle_are_said(monkeypatch, change, unsettled)
         monkeypatch.setattr(inspection, name, lambda *_, found=found: found)
     problem = SimpleNamespace(data=SimpleNamespace(start={}))
     declared = SimpleNamespace(problem=problem, rescale=lambda problem, _: (problem, change))
-    found = inspection.adjust(declared, "none", 0.001)
-    assert found.unsettled == unsettled and found.steps == (inspection.ROUNDS if unsettled else 1)
+    found = inspection.adjust(declared, "none", 0.001, max_rounds=7)
+    assert found.unsettled == unsettled and found.steps == (7 if unsettled else 1)
 
 
 @pytest.mark.parametrize("observed, said", [({}, True), ({"c": 700.5}, False)])
