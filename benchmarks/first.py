@@ -34,6 +34,7 @@ LIMITS = {EMPTY: 16.2, FULL: 9.3}
 def seconds_of(command: list[str], folder: str, terminal: bool = False) -> tuple[float, float]:
     """Seconds of a process, on the clock and of the processor."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package has its bytecode
     controller, output = pty.openpty() if terminal else (None, subprocess.DEVNULL)
     begin = time.perf_counter()
     process = subprocess.Popen(command, env=environment, stdout=output,
