@@ -9,6 +9,9 @@
 | `room` | a room with bare walls, pictures, identical books; some turned at one place |
 | `courtyard` | all around inside a courtyard, opposite wings with identical windows and roofs |
 | `drone` | from above, in strips with alternating headings; houses, trees, cars |
+| `lake` | the same over a shore: half is water, with waves of its own in each photograph |
+| `meadow` | the same over two layers of leaves that the wind moves; ground is seen between |
+| `video` | 60 frames of a walk around the statue: close together, blurred by motion, no EXIF |
 
 Every photograph has its own exposure, white balance and tone curve, vignetting and blur towards the
 edges, photon noise, sharpening halos, JPEG of quality 85. People and a car are at different places
@@ -170,8 +173,11 @@ def _sky(direction, moved):
     return grey + 0.8 * sun**200
 
 
-def taken(seed: int, mirrors: dict[int, float]) -> Callable[[Rendered, Shot], np.ndarray]:
-    """The processing of a consumer camera from light to file: RGB."""
+def taken(
+    seed: int, mirrors: dict[int, float], blurred: float = 0.0
+) -> Callable[[Rendered, Shot], np.ndarray]:
+    """The processing of a consumer camera from light to file: RGB. `blurred`: longest way of the
+    image during the exposure, of its width."""
 
     def finish(rendered: Rendered, shot: Shot):
         rng = np.random.default_rng(seed)
@@ -196,6 +202,8 @@ def taken(seed: int, mirrors: dict[int, float]) -> Callable[[Rendered, Shot], np
         soft = cv2.GaussianBlur(grey, (0, 0), 1.6 * columns / 1600)
         edge = np.clip((r2 - 0.25) / 1.3, 0, 1)
         grey = (1 - edge) * grey + edge * soft
+        if blurred:
+            grey = _moved(grey, blurred * columns * rng.uniform(), rng.uniform(0, np.pi))
         grey = np.clip(grey, 0, None) / 255
         grey = grey + np.sqrt(np.clip(grey, 0, 1) * 4e-4 + 2e-5) * rng.standard_normal(grey.shape)
         grey = np.clip(grey, 0, 1) ** rng.uniform(0.75, 1.0)
@@ -207,13 +215,26 @@ def taken(seed: int, mirrors: dict[int, float]) -> Callable[[Rendered, Shot], np
     return finish
 
 
-def _shots(prefix, stages, X0, at, width, focal, roll, exif=True):
+def _moved(grey, way: float, direction: float):
+    """An image that moved by `way` pixels during its exposure."""
+    half = int(np.ceil(way / 2)) + 1
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    for t in np.linspace(-way / 2, way / 2, 33):
+        x, y = half + t * np.cos(direction), half + t * np.sin(direction)
+        i, j = int(y), int(x)
+        across, down = np.array([1 - x + j, x - j]), np.array([1 - y + i, y - i])
+        kernel[i : i + 2, j : j + 2] += np.outer(down, across)
+    return cv2.filter2D(grey, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+
+
+def _shots(prefix, stages, X0, at, width, focal, roll, exif=True, quality=QUALITY,
+           blurred=0.0):  # fmt: skip
     X0, lens = np.asarray(X0, float), camera(width, focal)
     M = batched.matrices(stations_looking_at(X0, np.asarray(at, float), roll=roll).angles)
     told = ("Pocket", WRONG * focal) if exif else None
     return [
         Shot(f"{prefix}{k:02d}.jpg", Scene(tuple(s.shapes), tuple(s.textures)), lens, X0[k], M[k],
-             Sensor(fine=1), quality=QUALITY, exif=told, finish=taken(k, s.mirrors))
+             Sensor(fine=1), quality=quality, exif=told, finish=taken(k, s.mirrors, blurred))
         for k, s in enumerate(stages)
     ]  # fmt: skip
 
@@ -234,9 +255,8 @@ def _front(stage: Stage, y, columns, rows, spacing=3.0) -> None:
               period=1.5)  # fmt: skip
 
 
-def statue(width: int) -> list[Shot]:
-    rng = np.random.default_rng(31)
-    n, texel = 11, 0.5 * 6 / (0.9 * width)
+def _square(texel: float) -> Stage:
+    """A statue on a square."""
     stage = Stage(texel)
     stage.add(Rectangle((-30, -30, 0), (60, 0, 0), (0, 60, 0)), 1, period=0.8, contrast=0.1)
     stage.box((-0.9, -0.9, 0), (1.8, 1.8, 0.35), 10, contrast=0.08)
@@ -253,6 +273,13 @@ def statue(width: int) -> list[Shot]:
     _front(stage, 16.0, 8, 2)
     stage.tree(-8, 9, 2.0, 5.0, 60)
     stage.tree(9, 11, 1.5, 6.0, 70)
+    return stage
+
+
+def statue(width: int) -> list[Shot]:
+    rng = np.random.default_rng(31)
+    n = 11
+    stage = _square(0.5 * 6 / (0.9 * width))
     azimuth = np.radians(np.linspace(-160, -20, n)) + 0.04 * rng.normal(size=n)
     X0 = arc(1.0, azimuth, 0.0) * rng.uniform(5.0, 7.0, (n, 1)) + [0, 0, 1.7]
     X0[:, 2] += 0.15 * rng.normal(size=n)
@@ -265,6 +292,24 @@ def statue(width: int) -> list[Shot]:
         one.box((rng.uniform(-12, 8), 13, 0.3), (4.2, 1.8, 1.2), 400, mirror=0.4)
         stages.append(one)
     return _shots("s", stages, X0, at, width, 0.9, 0.03 * rng.normal(size=n))
+
+
+def video(width: int) -> list[Shot]:
+    rng = np.random.default_rng(38)
+    n = 60
+    stage = _square(0.5 * 6 / (0.9 * width))
+    shaken = lambda size: np.convolve(rng.normal(size=n + 4), np.ones(5) / 5, "valid") * size
+    azimuth = np.radians(np.linspace(-150, -30, n)) + shaken(0.01)
+    X0 = arc(1.0, azimuth, 0.0) * (6.0 + shaken(0.3))[:, None] + [0, 0, 1.6]
+    X0[:, 2] += shaken(0.08)
+    at = np.array([0, 0, 2.1]) + np.stack([shaken(0.3) for _ in range(3)], 1)
+    walker, stages = np.linspace(-5, 4, n), []
+    for k in range(n):
+        one = stage.with_others()
+        one.person(walker[k], 3.0, 300)  # walks through the picture
+        stages.append(one)
+    return _shots("frame", stages, X0, at, width, 0.9, shaken(0.05), exif=False, quality=70,
+                  blurred=0.004)  # fmt: skip
 
 
 def building(width: int) -> list[Shot]:
@@ -380,20 +425,28 @@ def courtyard(width: int) -> list[Shot]:
     return _shots("y", stages, X0, at, width, 0.9, 0.03 * rng.normal(size=n))
 
 
-def drone(width: int) -> list[Shot]:
-    rng = np.random.default_rng(36)
+def _flat(X, Y):
+    """Heights of nearly level ground."""
+    return 1.5 * np.sin(X / 25) * np.cos(Y / 30) + 0.4 * np.sin(X / 6 + Y / 9)
+
+
+def _flight(prefix, seed, width, slope=0.0, change=lambda stage, k: None) -> list[Shot]:
+    """A flight over ground with houses, trees and cars that rises by `slope` along X; `change` adds
+    what a single photograph shows."""
+    rng = np.random.default_rng(seed)
     high, focal, strips, each = 60.0, 0.75, 3, 5
     n = strips * each
     stage = Stage(0.5 * high / (focal * width))
-    ground = lambda X, Y: 1.5 * np.sin(X / 25) * np.cos(Y / 30) + 0.4 * np.sin(X / 6 + Y / 9)
+    ground = lambda X, Y: slope * X + _flat(X, Y)
     stage.add(HeightField(ground, (-150, -130, 150, 130)), 1, side=2048, contrast=0.12, mean=0.4)
     for k in range(14):
         (x, y), (a, b) = rng.uniform([-50, -40], [50, 40]), rng.uniform(5, 12, 2)
-        stage.box((x, y, -1), (a, b, rng.uniform(4, 10)), 100 + 7 * k, contrast=0.1,
+        stage.box((x, y, slope * x - 1), (a, b, rng.uniform(4, 10)), 100 + 7 * k, contrast=0.1,
                   mean=rng.uniform(0.3, 0.7))  # fmt: skip
     for k in range(8):
         (x, y), r = rng.uniform([-50, -40], [50, 40]), rng.uniform(1.5, 4)
-        stage.add(Ellipsoid((x, y, r), (r, r, 1.3 * r)), 500 + k, contrast=0.15, mean=0.3)
+        stage.add(Ellipsoid((x, y, slope * x + r), (r, r, 1.3 * r)), 500 + k, contrast=0.15,
+                  mean=0.3)  # fmt: skip
     along, aside = 0.25 * high / focal, 0.35 * 0.75 * high / focal
     X, Y = np.meshgrid(along * (np.arange(each) - 2), aside * (np.arange(strips) - 1))
     X0 = np.c_[X.ravel(), Y.ravel(), np.full(n, high)] + rng.normal(size=(n, 3)) * [1, 1, 0.7]
@@ -402,14 +455,38 @@ def drone(width: int) -> list[Shot]:
     for k in range(n):
         one = stage.with_others()
         for i in range(3):
-            one.box((*rng.uniform([-60, -50], [60, 50]), 0), (4.2, 1.8, 1.5), 900 + 10 * k + i)
+            x, y = rng.uniform([-60, -50], [60, 50])
+            one.box((x, y, slope * x), (4.2, 1.8, 1.5), 900 + 10 * k + i)
+        change(one, k)
         stages.append(one)
     roll = np.where(np.arange(n) // each % 2 == 1, np.pi, 0.0) + 0.03 * rng.normal(size=n)
-    return _shots("n", stages, X0, at, width, focal, roll)
+    return _shots(prefix, stages, X0, at, width, focal, roll)
+
+
+def drone(width: int) -> list[Shot]:
+    return _flight("n", 36, width)
+
+
+def lake(width: int) -> list[Shot]:
+    def waves(stage: Stage, k: int) -> None:
+        stage.add(Rectangle((-150, -130, 0), (300, 0, 0), (0, 260, 0)), 2000 + k, mirror=0.5,
+                  contrast=0.08, mean=0.2, side=2048)  # fmt: skip
+
+    return _flight("l", 37, width, 0.08, waves)
+
+
+def meadow(width: int) -> list[Shot]:
+    def wind(stage: Stage, k: int) -> None:
+        for layer, z in enumerate((1.8, 2.4)):
+            pattern = Texture(0.1, seed=2000 + 2 * k + layer, side=1024)
+            stage.add(Leaves((-150, -130, z), (300, 0, 0), (0, 260, 0), pattern),
+                      2100 + 2 * k + layer, mean=0.3, contrast=0.12)  # fmt: skip
+
+    return _flight("m", 39, width, change=wind)
 
 
 LIFELIKE: dict[str, Callable[[int], list[Shot]]] = {
-    f.__name__: f for f in (statue, building, room, courtyard, drone)
+    f.__name__: f for f in (statue, building, room, courtyard, drone, lake, meadow, video)
 }
 
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded on use
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from jaxbundle.plotting.style import round_number
 
@@ -177,5 +177,6 @@ def median_neighbour(places: Float[np.ndarray, "n d"], max_sample: int = 400) ->
     if len(different_places) < 2:
         return np.inf
     sample = places[:: -(-len(places) // max_sample)]
-    distances, _ = KDTree(different_places).query(sample, 2)  # the first is the place itself
+    tree = scipy.spatial.KDTree(different_places)
+    distances, _ = tree.query(sample, 2)  # the first is the place itself
     return float(np.median(distances[:, 1]))
