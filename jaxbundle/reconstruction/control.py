@@ -12,6 +12,7 @@ their UTM zone.
 
 import csv
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -110,7 +111,12 @@ Record = tuple[str, tuple[float, float, float], str, tuple[float, float], float,
 
 
 def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> Control:
-    records = []
+    records: list[Record] = []
+    # Rows without a name are of one point if their coordinates are equal, as text: the height tells
+    # apart points above each other on a façade. They are numbered from 1, past names that are taken.
+    taken = {cells[6] for _, line in rows if len(cells := _cells(line)) > 6}
+    numbered: dict[tuple[str, ...], str] = {}
+    numbered_names = (name for k in itertools.count(1) if (name := f"gcp{k}") not in taken)
     for number, line in rows:
         cells = _cells(line)
         if not _is_sighting(cells):
@@ -125,9 +131,11 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
                 f"{path}, line {number}: photograph {image!r} has no ending, such as .jpg; a name "
                 "with blanks needs tabs between the columns"
             )
-        # Without a name rows of one point are known by their equal coordinates, as text: the height
-        # tells apart points above each other on a façade.
-        name = "".join(cells[6:7]) or ",".join(cells[:3])
+        name = "".join(cells[6:7])
+        if not name:
+            place = tuple(cells[:3])
+            name = numbered[place] if place in numbered else next(numbered_names)
+            numbered[place] = name
         records.append((name, (X, Y, Z), image, (u, v), MANUAL_SIGMA, number))
     return _collect(path, records, system, {})
 

@@ -42,7 +42,7 @@ def test_gcp_list_of_opendronemap(tmp_path):
         "544256.7 5320919.9 5.0 1022.5 18 b.jpg gcp1 extra\n"
         "544157.7 5320899.2 5.5 4193 1552 a.jpg\n"
     )))  # fmt: skip
-    assert found.points.id == ("gcp1", "544157.7,5320899.2,5.5") and found.system == "EPSG:32633"
+    assert found.points.id == ("gcp1", "gcp2") and found.system == "EPSG:32633"  # gcp1 is taken
     assert found.sightings[:2] == (("a.jpg", "gcp1"), ("b.jpg", "gcp1"))
     np.testing.assert_allclose(found.xy[1], [1022.5, 18])
     assert np.isnan(found.points.sigma).all()
@@ -53,8 +53,8 @@ def test_points_without_names_are_told_apart_by_their_coordinates(tmp_path):
     found = read_control_measurements(written(tmp_path, (
         "EPSG:32633\n1\t2\t3\t4\t5\ta.jpg\t\n1\t2\t9\t4\t1\ta.jpg\t\n1\t2\t3\t4\t5\tb.jpg\t\n"
     )))  # fmt: skip
-    assert found.points.id == ("1,2,3", "1,2,9")
-    assert [id for _, id in found.sightings] == ["1,2,3", "1,2,9", "1,2,3"]
+    assert found.points.id == ("gcp1", "gcp2")
+    assert [id for _, id in found.sightings] == ["gcp1", "gcp2", "gcp1"]
 
 
 def test_one_row_states_the_role_of_a_point(tmp_path):
