@@ -113,7 +113,7 @@ Record = tuple[str, tuple[float, float, float], str, tuple[float, float], float,
 def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> Control:
     records: list[Record] = []
     # Rows without a name are of one point if their coordinates are equal, as text: the height tells
-    # apart points above each other on a façade. They are numbered from 1, past names that are taken.
+    # apart points above each other on a façade. Names that others have are passed over.
     taken = {cells[6] for _, line in rows if len(cells := _cells(line)) > 6}
     numbered: dict[tuple[str, ...], str] = {}
     numbered_names = (name for k in itertools.count(1) if (name := f"gcp{k}") not in taken)
