@@ -128,6 +128,7 @@ def test_markers_without_names_are_told_apart():
         assert (len({m.frame for m in shuffled}) - len(found) // 3 > 0) == bool(said)
 
 
+@pytest.mark.further
 def test_two_markers_that_look_alike():
     """Their rays tell which is which in all cameras of a frame; a camera whose frames are not
     simultaneous agrees with none."""

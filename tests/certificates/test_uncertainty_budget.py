@@ -94,6 +94,7 @@ def test_image_coordinates_have_the_unit_of_the_camera_model():
     assert of_image and {line.unit for line in of_image} == {"mm"}
 
 
+@pytest.mark.further
 def test_estimated_sigmas_have_the_redundancy_of_their_own_group():
     """Of control in X, Y, Z each; the priors of two stations are as stated."""
     changes = dict(fixed=0, control=4, held=(), distances=((5, 7), (6, 8)), domain="measured")

@@ -138,6 +138,7 @@ def test_photographs_of_another_size_or_missing_are_named(project, tmp_path, com
     assert told.status == 2 and "20 × 10" in told.err
 
 
+@pytest.mark.further
 def test_a_block_of_photographs_above_the_other_surface(project, tmp_path, command):
     """From the ellipsoid to the geoid, and back; heights searched are above the same."""
     folder, _ = project
