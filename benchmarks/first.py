@@ -28,7 +28,7 @@ import machine
 EXAMPLE = Path(__file__).parents[1] / "examples" / "convergent4" / "project.toml"
 EMPTY, FULL, TERMINAL = "empty folder of programs", "full folder of programs", "full, on a terminal"
 IMPORT = "import of JAX"
-LIMITS = {EMPTY: 16.2, FULL: 9.3}
+LIMITS = {EMPTY: 11.5, FULL: 6.4}
 
 
 def seconds_of(command: list[str], folder: str, terminal: bool = False) -> tuple[float, float]:
