@@ -22,6 +22,7 @@ from jaxbundle.leastsquares.quality.error_components import (
     quadratic_forms,
 )
 from jaxbundle.leastsquares.quality.error_effects import effects, remove_fit, stack_rows
+from jaxbundle.leastsquares.quality.estimated_sizes import raise_to_white
 from jaxbundle.leastsquares.quality.size_traces import Traces
 from jaxbundle.leastsquares.solution import Solution
 
@@ -204,6 +205,44 @@ def test_traces_from_some_of_the_clusters_are_near_those_of_all(distances):
     np.testing.assert_allclose(some[0].T[few], exact.T[few], rtol=1e-9)
     np.testing.assert_allclose(np.mean([one.T for one in some], 0), exact.T, rtol=0.05)
     np.testing.assert_allclose(np.mean([one.cubes for one in some], 0), exact.cubes, rtol=0.25)
+
+
+def test_sizes_have_a_variance_whatever_the_clusters_that_it_is_from(distances):
+    """Errors along tracks are nearly independent ones there: the difference of two nearly equal
+    traces, what is from one of the clusters, would leave negative variances. Of independent errors
+    the covariance of the forms is exact."""
+    found, _, _, given, used = distances
+    parts = components_of_distances(given, used)
+    independent = sp.diags(used.astype(float)) @ sp.eye(len(used), len(given[0]))
+    parts[1] = ErrorComponent("along", "σ", (independent + 0.3 * parts[1].root).tocsr())
+    for seed in range(12):
+        settings = ErrorSettings(max_columns=20, max_clusters=1, seed=seed)
+        model = fit_error_model(found, parts, settings)
+        assert np.isfinite(model.theta_sigma).all() and (model.theta_sigma > 0).all()
+        products = products_of(found, parts, settings)
+        traces = products.traces(1, np.random.default_rng(seed))
+        white = traces.covariance_of_forms(np.eye(5)[0])
+        np.testing.assert_allclose(white, 2 * traces.T, rtol=1e-9)
+
+
+def test_forms_are_raised_to_those_of_independent_errors():
+    rng = np.random.default_rng(3)
+    M = rng.normal(size=(30, 8))
+    M = np.eye(30) - M @ np.linalg.solve(M.T @ M, M.T)
+    V = [np.eye(30), *(f @ f.T for f in rng.normal(size=(3, 30, 4)))]
+    T = np.array([[np.trace(M @ a @ M @ b) for b in V] for a in V])
+    A = M @ (0.7 * V[0] + 0.2 * V[1] + 0.1 * V[3]) @ M
+    forms = 2 * np.array([[np.trace(A @ a @ A @ b) for b in V] for a in V])
+    np.testing.assert_allclose(raise_to_white(forms, T, 0.7), forms, rtol=1e-9)
+    least = 2 * 0.7**2 * T
+    disturbed = forms - 1.5 * np.outer(forms[0], forms[0]) / forms[0, 0]
+    assert np.linalg.eigvalsh(disturbed).min() < 0
+    excess = np.linalg.eigvals(np.linalg.solve(T, raise_to_white(disturbed, T, 0.7) - least))
+    assert excess.real.min() > -1e-9
+    # A component that is a combination of others has no direction of its own.
+    B = np.vstack([np.eye(4), [1, 2, 0, 0]])
+    twice = B @ forms @ B.T
+    np.testing.assert_allclose(raise_to_white(twice, B @ T @ B.T, 0.7), twice, rtol=1e-8)
 
 
 def test_intervals_hold_although_sizes_are_estimated(network):

@@ -50,6 +50,7 @@ from jaxbundle.leastsquares.quality.error_products import ErrorProducts, error_p
 from jaxbundle.leastsquares.quality.estimated_sizes import (
     SizeEquations,
     inverse_of_traces,
+    raise_to_white,
     widening,
 )
 from jaxbundle.leastsquares.quality.size_traces import Traces
@@ -387,7 +388,11 @@ def fit_error_model(
             part = np.eye(len(theta))
             part[-1, 0] = -1.0
             forms = (part.T @ forms @ part)[:-1, :-1]
-    inverse = inverse_of_traces(system.reduced[0])
+    T_of_estimated, _ = system.reduced
+    # What is from some of the clusters, or from drawn errors, may leave a negative variance.
+    least = theta[0] + min(theta[-1], 0.0) if has_others else theta[0]
+    forms = raise_to_white(forms, T_of_estimated, max(least, 0.0))
+    inverse = inverse_of_traces(T_of_estimated)
     covariance = inverse @ forms @ inverse
     if has_others:
         # θ of the given rows is σ0² − θ_0, so that their sum is σ0² whatever θ_0 is

@@ -388,6 +388,7 @@ class ErrorProducts:
         a3, a4, b2, near, R2, R3 = (share * x for x in (a3, a4, b2, near, R2, R3))
         # From powers of P·V between F̃ to those of M·V: what the kept unknowns take is subtracted.
         R1 = factor * self.few + near
+        np.fill_diagonal(R1, diagonal)  # as in T, so that both agree for independent errors
         R2 = R2 - b1.T @ b1
         cross = b1.T @ b2
         R3 = R3 - cross - cross.T + b1.T @ a1 @ b1

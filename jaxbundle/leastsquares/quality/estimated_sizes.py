@@ -163,6 +163,26 @@ def inverse_of_traces(T: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
     return np.linalg.pinv(T, RANK_TOLERANCE, hermitian=True)
 
 
+def raise_to_white(
+    forms: Float[np.ndarray, "k k"], T: Float[np.ndarray, "k k"], theta: float
+) -> Float[np.ndarray, "k k"]:
+    """An approximate covariance of quadratic forms, raised where it is below that of independent
+    errors of the size `theta`, 2·theta²·T, which others can only add to.
+
+    With A = MΣM ⪰ θ·M = B, of every combination V of the components
+
+        tr(VAVA) − tr(VBVB) = tr(V(A − B)V·A) + tr(VBV·(A − B)) ≥ 0."""
+    scale = np.sqrt(np.where(np.diag(T) > 0, np.diag(T), 1.0))
+    w, E = np.linalg.eigh(T / scale[:, None] / scale)
+    some = w > RANK_TOLERANCE * w.max()
+    # T = R·Rᵀ; in its coordinates that of independent errors is a multiple of 1.
+    R = scale[:, None] * E[:, some] * np.sqrt(w[some])
+    inverse = (E[:, some] / np.sqrt(w[some])).T / scale
+    ratio, U = np.linalg.eigh(inverse @ (forms + forms.T) @ inverse.T / 2)
+    root = R @ U * np.sqrt(np.maximum(ratio, 2 * theta**2))
+    return root @ root.T
+
+
 def _nonnegative(
     T: Float[np.ndarray, "k k"], q: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " k"]:
