@@ -150,6 +150,9 @@ def test_what_chance_explains_is_exceeded_by_chance_in_a_thousandth(number):
     (LeftOut("tie point", ("8", "9", "7"), "…"), DOUBTFUL, "3 of 13 points left out"),
     (LeftOut("image", ("9",), "…"), DOUBTFUL, "1 of 5 images left out"),
     (LeftOut("image point", ("9 in 1",), "…"), NOTED, "1 of 41 image points left out"),
+    # As many as data snooping may remove, 5 %.
+    (LeftOut("image point", ("8 in 1", "9 in 1"), "…"), NOTED, "2 of 42 image points left out"),
+    (LeftOut("image point", ("7", "8", "9"), "…"), DOUBTFUL, "3 of 43 image points left out"),
     (LeftOut("point", tuple("abcdefghij"), "without any ray", False), NOTED,
      "points without enough rays"),
 ])  # fmt: skip

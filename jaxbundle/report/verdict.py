@@ -363,7 +363,7 @@ def judge_blunders(
     if largest > limit:
         number_left = int((size > limit).sum())
         return Finding("Blunders", DOUBTFUL, words, f"{count(number_left, 'blunder')} likely")
-    if number_removed > max(LARGEST_FRACTION_REMOVED * rays, explained_by_chance(rays)):
+    if number_removed > most_removed(rays):
         brief = f"{number_removed} of {rays:.0f} image points removed as blunders"
         return Finding("Blunders", DOUBTFUL, words, brief)
     # More than chance explains, but none that stands out: σ of some are too small.
@@ -393,9 +393,15 @@ def explained_by_chance(number: float, level: float = LEVEL) -> float:
     return expected + 3 * np.sqrt(expected) + 1
 
 
+def most_removed(number: float, level: float = LEVEL) -> float:
+    """The largest number of blunders among `number` observations of a good result, whether tests at
+    a `level` removed them or they were left out at the start."""
+    return max(LARGEST_FRACTION_REMOVED * number, explained_by_chance(number, level))
+
+
 def _left_out(adjustment: "Adjustment") -> list[Finding]:
-    """What was left out although it was measured often enough: a note if a test rejects as many by
-    chance, or if rays do not determine so few points; photographs never are."""
+    """What was left out although it was measured often enough: a note if data snooping might have
+    removed as many, or if rays do not determine so few points; photographs never are."""
     network = adjustment.problem.network
     notes = [note for note in network.left_out if note.names]
     if not notes:
@@ -417,7 +423,7 @@ def _left_out(adjustment: "Adjustment") -> list[Finding]:
     doubtful = [
         noun
         for noun, n in number.items()
-        if noun == "image" or n > explained_by_chance(n + number_kept.get(noun, 0))
+        if noun == "image" or n > most_removed(n + number_kept.get(noun, 0))
     ]
     number_few = sum(len(note.names) for note in notes if not note.measured)
     words = [*share.values(), *([f"{number_few} without enough rays"] if number_few else [])]

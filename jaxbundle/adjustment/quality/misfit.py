@@ -5,7 +5,7 @@ too small σ do; σ0 is changed by both, which separates the two causes.
 """
 
 from jaxbundle.leastsquares.quality.global_test import CONTRADICTING_RATIO, contradicts
-from jaxbundle.report.verdict import LARGEST_FRACTION_REMOVED, explained_by_chance
+from jaxbundle.report.verdict import most_removed
 
 
 def doubt_of_baarda(
@@ -31,7 +31,7 @@ def doubt_of_baarda(
             f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as "
             f"large as they imply: it has {consequence} ({took}). {_remedy(scale)}, or {pope}"
         )
-    if removed > max(LARGEST_FRACTION_REMOVED * rays, explained_by_chance(rays, by_chance)):
+    if removed > most_removed(rays, by_chance):
         return (
             f"Baarda's test has removed many observations ({took}): there are as many blunders, or "
             f"the a priori σ are a little too small. Look at what was removed, or {pope}"
