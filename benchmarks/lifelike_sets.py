@@ -14,9 +14,10 @@
 | `video` | 60 frames of a walk around the statue: close together, blurred by motion, no EXIF |
 
 Every photograph has its own exposure, white balance and tone curve, vignetting and blur towards the
-edges, photon noise, sharpening halos, JPEG of quality 85. People and a car are at different places
-in each; clouds move; panes and bronze mirror the sky, so that reflections move with the camera.
-EXIF states a principal distance that is 5 % too long (`room`: none).
+edges, photon noise, sharpening halos, JPEG of quality 85 (`video`: 70). People and a car are at
+different places in each; clouds move; panes and bronze mirror the sky, so that reflections move
+with the camera.
+EXIF states a principal distance that is 5 % too long (`room`, `video`: none).
 """
 
 import dataclasses
@@ -176,8 +177,8 @@ def _sky(direction, moved):
 def taken(
     seed: int, mirrors: dict[int, float], blurred: float = 0.0
 ) -> Callable[[Rendered, Shot], np.ndarray]:
-    """The processing of a consumer camera from light to file: RGB. `blurred`: longest way of the
-    image during the exposure, of its width."""
+    """The processing of a consumer camera from light to file: RGB. `blurred`: the longest motion of
+    the image during the exposure, relative to its width."""
 
     def finish(rendered: Rendered, shot: Shot):
         rng = np.random.default_rng(seed)
@@ -215,11 +216,11 @@ def taken(
     return finish
 
 
-def _moved(grey, way: float, direction: float):
-    """An image that moved by `way` pixels during its exposure."""
-    half = int(np.ceil(way / 2)) + 1
+def _moved(grey, distance: float, direction: float):
+    """An image that moved by `distance` pixels during its exposure."""
+    half = int(np.ceil(distance / 2)) + 1
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-    for t in np.linspace(-way / 2, way / 2, 33):
+    for t in np.linspace(-distance / 2, distance / 2, 33):
         x, y = half + t * np.cos(direction), half + t * np.sin(direction)
         i, j = int(y), int(x)
         across, down = np.array([1 - x + j, x - j]), np.array([1 - y + i, y - i])

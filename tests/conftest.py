@@ -21,7 +21,8 @@ EXAMPLES = ROOT / "examples"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# As a user's: each of some hundred processes would compile the modules again, two seconds of work.
+# As on a user's machine: else every process that a test starts compiles the modules again, for two
+# seconds of the processor.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 os.environ.setdefault(

@@ -23,6 +23,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.control import read_control
 from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.network.columns import count, list_some
 from jaxbundle.network.rules import check_choice
 from jaxbundle.network.tables import ROLES, Points, Source
 from jaxbundle.photographs.places import to_map
@@ -37,13 +38,14 @@ MANUAL_SIGMA = 1.0
 @dataclasses.dataclass(frozen=True)
 class Control:
     """Control points, and their image points: rows of (photograph, point); `system`: its
-    name."""
+    name; `notes`: what was assumed in reading."""
 
     points: Points
     sightings: tuple[tuple[str, str], ...]
     xy: Float[np.ndarray, "n 2"]
     sigma: Float[np.ndarray, " n"]
     system: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def with_sigma(control: Control, text: str) -> Control:
@@ -137,7 +139,12 @@ def _read_gcp_list(path: Path, system: str, rows: Sequence[tuple[int, str]]) -> 
             name = numbered[place] if place in numbered else next(numbered_names)
             numbered[place] = name
         records.append((name, (X, Y, Z), image, (u, v), MANUAL_SIGMA, number))
-    return _collect(path, records, system, {})
+    control = _collect(path, records, system, {})
+    if not numbered:
+        return control
+    names = list_some(numbered.values(), as_text=str)
+    have = f"{count(len(numbered), 'point')} without a name, numbered in the order of the list"
+    return dataclasses.replace(control, notes=(f"{path.name}: {have}: {names}",))
 
 
 def _cells(line: str) -> list[str]:

@@ -128,6 +128,7 @@ def reconstruct(
     names = tuple(p.name for p in photographs)
     frame = None
     if control is not None:
+        notes += control.notes
         points = control.points.take(~control.points.has_role("tie"))
         frame = FrameData(
             points, named_measurements, names, control.system, positions and positions[:2]

@@ -22,7 +22,7 @@ from jaxbundle.leastsquares.quality.error_components import (
     quadratic_forms,
 )
 from jaxbundle.leastsquares.quality.error_effects import effects, remove_fit, stack_rows
-from jaxbundle.leastsquares.quality.estimated_sizes import raise_to_white
+from jaxbundle.leastsquares.quality.estimated_sizes import raise_to_independent
 from jaxbundle.leastsquares.quality.size_traces import Traces
 from jaxbundle.leastsquares.solution import Solution
 
@@ -208,9 +208,9 @@ def test_traces_from_some_of_the_clusters_are_near_those_of_all(distances):
 
 
 def test_sizes_have_a_variance_whatever_the_clusters_that_it_is_from(distances):
-    """Errors along tracks are nearly independent ones there: the difference of two nearly equal
-    traces, what is from one of the clusters, would leave negative variances. Of independent errors
-    the covariance of the forms is exact."""
+    """Errors along tracks are almost independent of each other here, so that the two sizes can
+    hardly be told apart: a covariance from a single cluster gave them negative variances. For
+    independent errors the covariance of the forms is exact."""
     found, _, _, given, used = distances
     parts = components_of_distances(given, used)
     independent = sp.diags(used.astype(float)) @ sp.eye(len(used), len(given[0]))
@@ -233,16 +233,16 @@ def test_forms_are_raised_to_those_of_independent_errors():
     T = np.array([[np.trace(M @ a @ M @ b) for b in V] for a in V])
     A = M @ (0.7 * V[0] + 0.2 * V[1] + 0.1 * V[3]) @ M
     forms = 2 * np.array([[np.trace(A @ a @ A @ b) for b in V] for a in V])
-    np.testing.assert_allclose(raise_to_white(forms, T, 0.7), forms, rtol=1e-9)
+    np.testing.assert_allclose(raise_to_independent(forms, T, 0.7), forms, rtol=1e-9)
     least = 2 * 0.7**2 * T
     disturbed = forms - 1.5 * np.outer(forms[0], forms[0]) / forms[0, 0]
     assert np.linalg.eigvalsh(disturbed).min() < 0
-    excess = np.linalg.eigvals(np.linalg.solve(T, raise_to_white(disturbed, T, 0.7) - least))
+    excess = np.linalg.eigvals(np.linalg.solve(T, raise_to_independent(disturbed, T, 0.7) - least))
     assert excess.real.min() > -1e-9
     # A component that is a combination of others has no direction of its own.
     B = np.vstack([np.eye(4), [1, 2, 0, 0]])
     twice = B @ forms @ B.T
-    np.testing.assert_allclose(raise_to_white(twice, B @ T @ B.T, 0.7), twice, rtol=1e-8)
+    np.testing.assert_allclose(raise_to_independent(twice, B @ T @ B.T, 0.7), twice, rtol=1e-8)
 
 
 def test_intervals_hold_although_sizes_are_estimated(network):

@@ -54,6 +54,8 @@ def test_points_without_names_are_told_apart_by_their_coordinates(tmp_path):
         "EPSG:32633\n1\t2\t3\t4\t5\ta.jpg\t\n1\t2\t9\t4\t1\ta.jpg\t\n1\t2\t3\t4\t5\tb.jpg\t\n"
     )))  # fmt: skip
     assert found.points.id == ("gcp1", "gcp2")
+    (note,) = found.notes
+    assert "2 points without a name, numbered in the order of the list: gcp1, gcp2" in note
     assert [id for _, id in found.sightings] == ["gcp1", "gcp2", "gcp1"]
 
 

@@ -50,7 +50,7 @@ from jaxbundle.leastsquares.quality.error_products import ErrorProducts, error_p
 from jaxbundle.leastsquares.quality.estimated_sizes import (
     SizeEquations,
     inverse_of_traces,
-    raise_to_white,
+    raise_to_independent,
     widening,
 )
 from jaxbundle.leastsquares.quality.size_traces import Traces
@@ -389,9 +389,10 @@ def fit_error_model(
             part[-1, 0] = -1.0
             forms = (part.T @ forms @ part)[:-1, :-1]
     T_of_estimated, _ = system.reduced
-    # What is from some of the clusters, or from drawn errors, may leave a negative variance.
+    # The forms are from some of the clusters, or from drawn errors: their own errors could leave a
+    # negative variance. Σ ⪰ least·1; the θ of `OTHERS`, added to that of all, may be negative.
     least = theta[0] + min(theta[-1], 0.0) if has_others else theta[0]
-    forms = raise_to_white(forms, T_of_estimated, max(least, 0.0))
+    forms = raise_to_independent(forms, T_of_estimated, max(least, 0.0))
     inverse = inverse_of_traces(T_of_estimated)
     covariance = inverse @ forms @ inverse
     if has_others:

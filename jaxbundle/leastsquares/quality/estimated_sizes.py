@@ -163,7 +163,7 @@ def inverse_of_traces(T: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
     return np.linalg.pinv(T, RANK_TOLERANCE, hermitian=True)
 
 
-def raise_to_white(
+def raise_to_independent(
     forms: Float[np.ndarray, "k k"], T: Float[np.ndarray, "k k"], theta: float
 ) -> Float[np.ndarray, "k k"]:
     """An approximate covariance of quadratic forms, raised where it is below that of independent
@@ -172,15 +172,23 @@ def raise_to_white(
     With A = MΣM ⪰ θ·M = B, of every combination V of the components
 
         tr(VAVA) − tr(VBVB) = tr(V(A − B)V·A) + tr(VBV·(A − B)) ≥ 0."""
+    scale, L, inverse = _scaled_root(T)
+    inverse = inverse / scale
+    ratio, U = np.linalg.eigh(inverse @ (forms + forms.T) @ inverse.T / 2)
+    root = scale[:, None] * L @ U * np.sqrt(np.maximum(ratio, 2 * theta**2))
+    return root @ root.T
+
+
+def _scaled_root(
+    T: Float[np.ndarray, "k k"],
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k r"], Float[np.ndarray, "r k"]]:
+    """D, as a vector, and L of T = D·L·Lᵀ·D, with the pseudo-inverse of L. T is symmetric and
+    positive semidefinite; components have different units, which D takes out."""
     scale = np.sqrt(np.where(np.diag(T) > 0, np.diag(T), 1.0))
     w, E = np.linalg.eigh(T / scale[:, None] / scale)
     some = w > RANK_TOLERANCE * w.max()
-    # T = R·Rᵀ; in its coordinates that of independent errors is a multiple of 1.
-    R = scale[:, None] * E[:, some] * np.sqrt(w[some])
-    inverse = (E[:, some] / np.sqrt(w[some])).T / scale
-    ratio, U = np.linalg.eigh(inverse @ (forms + forms.T) @ inverse.T / 2)
-    root = R @ U * np.sqrt(np.maximum(ratio, 2 * theta**2))
-    return root @ root.T
+    root = np.sqrt(w[some])
+    return scale, E[:, some] * root, (E[:, some] / root).T
 
 
 def _nonnegative(
@@ -189,14 +197,9 @@ def _nonnegative(
     """θ ≥ 0 of T·θ = q, in the metric of T itself (the covariance of q is 2·T for white errors)."""
     from scipy.optimize import nnls
 
-    scale = np.sqrt(np.where(np.diag(T) > 0, np.diag(T), 1.0))
-    A = T / scale[:, None] / scale
-    # T is symmetric and positive semidefinite: T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
-    w, E = np.linalg.eigh(A)
-    some = w > RANK_TOLERANCE * w.max()
-    L = E[:, some] * np.sqrt(w[some])
-    right = (E[:, some].T @ (q / scale)) / np.sqrt(w[some])
-    return nnls(L.T, right)[0] / scale
+    # T = L·Lᵀ, and ‖Lᵀθ − L⁻¹q‖ is the least-squares form
+    scale, L, inverse = _scaled_root(T)
+    return nnls(L.T, inverse @ (q / scale))[0] / scale
 
 
 def _significant(
