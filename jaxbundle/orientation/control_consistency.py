@@ -38,8 +38,10 @@ from jaxbundle.leastsquares.quality.distributions import (
 MAX_POINTS_FOR_PAIRS = 20
 # Control points that remain at least: three of a similarity always nearly agree.
 MIN_AGREEING = 4
-# Of an estimated σ: its relative σ is 1/√(2·redundancy), 40 %.
-MIN_REDUNDANCY = 3.0
+# The relative σ of an estimated σ is 1/√(2·redundancy): at most 100 % for weights, where a σ assumed
+# instead may be wrong a hundredfold, and 40 % to test points with it.
+MIN_REDUNDANCY = 0.5
+MIN_REDUNDANCY_OF_TEST = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,8 +238,8 @@ def _predict(
     has_unknown_sigma, p = np.isnan(discrepancies.sigma).ravel()[rows[tested_rows]], []
     for height, freedom in enumerate(model.redundancy):
         part = np.flatnonzero((rows[tested_rows] % 3 == 2) == height)
-        if not len(part) or (has_unknown_sigma[part].any() and freedom < MIN_REDUNDANCY):
-            continue  # an assumed σ tests nothing
+        if not len(part) or (has_unknown_sigma[part].any() and freedom < MIN_REDUNDANCY_OF_TEST):
+            continue  # an assumed σ tests nothing, nor one from two or three residuals
         T = float(e[part] @ np.linalg.solve(covariance[np.ix_(part, part)], e[part]))
         p.append(
             f_tail(T / len(part), len(part), freedom)

@@ -6,7 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.orientation.control_consistency import Assessment
+from jaxbundle.orientation.control_consistency import (
+    MIN_REDUNDANCY,
+    MIN_REDUNDANCY_OF_TEST,
+    Assessment,
+)
 from jaxbundle.report.layout import column_decimals, fixed, significant
 
 # The columns of the table; d: adjusted minus given; px: RMS distance of the projected point from
@@ -31,8 +35,8 @@ class ControlPoint:
     """A control or check point: `role` as given, whether it was `used`; rays that were used; given
     coordinates and their σ (NaN: exact, infinite: not controlled); adjusted minus given; RMS image
     residual, pixels; `verdict` in words; `prediction` of it from everything else, predicted minus
-    given, and its σ; `measurements`: every image measurement. Lengths in the object unit, NaN: not
-    there."""
+    given, and its σ; `measurements`: every image measurement; `removed_axes`: its coordinates that
+    data snooping removed, of "XYZ". Lengths in the object unit, NaN: not there."""
 
     id: str
     role: str
@@ -46,6 +50,12 @@ class ControlPoint:
     prediction: Float[np.ndarray, "3"]
     prediction_sigma: Float[np.ndarray, "3"]
     measurements: tuple["ControlMeasurement", ...]
+    removed_axes: str = ""
+
+    @property
+    def agreeing_residual(self) -> Float[np.ndarray, "3"]:
+        """The residual without the coordinates that were removed: the fit of what was used."""
+        return np.where([axis in self.removed_axes for axis in "XYZ"], np.nan, self.residual)
 
     @property
     def wrong_measurements(self) -> list[str]:
@@ -84,6 +94,7 @@ class ControlPoint:
             "residual": axes(self.residual),
             "image_residual": self.image_residual if np.isfinite(self.image_residual) else None,
             "verdict": self.verdict,
+            "removed": list(self.removed_axes),
             "prediction": {"error": axes(self.prediction), "sigma": axes(self.prediction_sigma)},
             "measurements": [dataclasses.asdict(measurement) for measurement in self.measurements],
         }
@@ -106,7 +117,7 @@ class ControlTable:
             residuals = [p.residual for p in self.points if p.role == "check"]
         else:
             # Without those left out: the fit of what the result rests on.
-            residuals = [p.residual for p in self.points if p.used]
+            residuals = [p.agreeing_residual for p in self.points if p.used]
         residual_rows = np.array(residuals).reshape(-1, 3)
         number = np.isfinite(residual_rows).sum(0)
         with np.errstate(invalid="ignore"):
@@ -180,12 +191,20 @@ def describe_sigma(
         if name == "in height" and heights_as_in_plane:
             how = "as in the plane: heights that are all 0 are not taken for better ones"
         elif assessed.assumed[part]:
+            why = (
+                "too few control points to estimate it"
+                if r < MIN_REDUNDANCY
+                else "its residuals do not show a larger one"
+            )
             how = (
-                f"assumed, {assumed_pixels:g} pixels on the ground, because its residuals do not "
-                "show a larger one (state it with --control-sigma)"
+                f"assumed, {assumed_pixels:g} pixels on the ground, because {why} (state it with "
+                "--control-sigma)"
             )
         else:
-            how = f"estimated from the residuals of control (redundancy {r:.1f})"
+            how = f"estimated from the residuals of control (redundancy {r:.1f}"
+            if r < MIN_REDUNDANCY_OF_TEST:
+                how += ": too low to find wrong points; state it with --control-sigma"
+            how += ")"
         words.append(f"control without σ: {significant(sigma, 2)} {unit} {name}, {how}")
     if fixed:
         words.append(

@@ -114,6 +114,7 @@ def georeference(
     )
     positions = camera_positions(result)
     notes = [heights] * bool(heights) + choice.remarks()
+    notes += [f"data snooping removed {name}" for name in _removed_of_control(result, control)]
     notes += [] if positions is None else positions.contradictions(block.settings.offset_sigma, "m")
     table = ControlTable(tuple(_tabulate(result, block, control, choice)), words, tuple(notes), "m")
     return dataclasses.replace(weighted, adjustment=result, agreeing_rays=int(is_used.sum())), table
@@ -126,7 +127,7 @@ def _tabulate(
     final = OrientedBlock(result, block.frame, block.settings)
     checks, points = result.check_points, result.problem.network.points.id
     compared = {} if checks is None else {id: k for k, id in enumerate(checks.id)}
-    snooped = [removed.name for removed in result.removed]
+    snooped = _removed_of_control(result, control)
     predicted, rays = _predict(result, control, choice), _predict_rays(result, control)
     for k, id in enumerate(control.id):
         # The last adjustment may have lost photographs with their measurements.
@@ -150,6 +151,7 @@ def _tabulate(
             *choice.errors.get(id, []),
         ]
         reasons += [f"data snooping removed {name}" for name in snooped if _is_of_point(name, id)]
+        removed_axes = [axis for axis in "XYZ" if f"{axis} of control point {id}" in snooped]
         yield ControlPoint(
             id,
             control.role[k],
@@ -162,7 +164,14 @@ def _tabulate(
             ": ".join([verdict, "; ".join(reasons)]) if reasons else verdict,
             *predicted.get(id, (np.full(3, np.nan), np.full(3, np.nan))),
             tuple(_measurements(final, id, measured, away, rays)),
+            "".join(removed_axes),
         )
+
+
+def _removed_of_control(result: Adjustment, control: Points) -> list[str]:
+    """The names of removed observations of control and check points."""
+    names = [removed.name for removed in result.removed]
+    return [name for name in names if any(_is_of_point(name, id) for id in control.id)]
 
 
 def _is_of_point(removed: str, id: str) -> bool:

@@ -159,11 +159,16 @@ def _judge_control(part: ReconstructedPart) -> list[Finding]:
     wrong = [f"{clean(p.id)} in {clean(m)}" for p in control.points for m in p.wrong_measurements]
     if wrong:
         words += f"; wrong measurements: {', '.join(wrong)}"
+    removed = [f"{axis} of {clean(p.id)}" for p in used_points for axis in p.removed_axes]
+    if removed:
+        words += f"; coordinates that data snooping removed: {', '.join(removed)}"
     is_held = any(p.verdict.startswith("held exactly") for p in used_points)
     doubts = [f"control left out: {list_some(left_out, 3, clean)}"] if left_out else []
     if wrong:
         name = "wrong measurement" if len(wrong) == 1 else "wrong measurements"
         doubts.append(f"{name}: {list_some(wrong, 3, str)}")
+    if removed:
+        doubts.append(f"control removed by data snooping: {list_some(removed, 3, str)}")
     doubts += ["control held exactly"] if is_held else []
     state = DOUBTFUL if doubts else GOOD
     findings = [Finding("Control", state, words, ", ".join(doubts))]

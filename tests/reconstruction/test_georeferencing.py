@@ -285,6 +285,21 @@ def test_a_photograph_that_the_last_adjustment_loses_takes_its_measurements_alon
         assert {one.image for one in point.measurements} == images - {drone.images[0]}
 
 
+def test_a_removed_coordinate_of_control_is_named_and_not_in_its_rms(drone):
+    """Of four points, the fewest that remain, none is left out for one wrong coordinate: data
+    snooping removes this."""
+    X = drone.truth.copy()
+    X[8, 0] += 1.0
+    roles = tuple("control" if k in (0, 2, 6, 8) else "check" for k in range(CONTROL))
+    _, points, table = controlled(drone, drone.given(X, 0.02, roles, positions=False))
+    point = points["gcp08"]
+    assert point.used and point.removed_axes == "X" and point.verdict.startswith("used: ")
+    assert "data snooping removed X of control point gcp08" in table.notes
+    assert abs(point.residual[0]) > 0.9 and table.rms("control")[0] < 0.04
+    assert table.as_dict()["points"]["gcp08"]["removed"] == ["X"]
+    assert not any(other.removed_axes for other in table.points if other is not point)
+
+
 @pytest.mark.parametrize("id, removed, of_it", [
     ("5", "point 5 in image a.jpg", True),
     ("5", "either of point 4 in image a.jpg or point 5 in image b.jpg", True),
