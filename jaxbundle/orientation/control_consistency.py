@@ -38,8 +38,8 @@ from jaxbundle.leastsquares.quality.distributions import (
 MAX_POINTS_FOR_PAIRS = 20
 # Control points that remain at least: three of a similarity always nearly agree.
 MIN_AGREEING = 4
-# The relative σ of an estimated σ is 1/√(2·redundancy): at most 100 % for weights, where a σ assumed
-# instead may be wrong a hundredfold, and 40 % to test points with it.
+# The relative σ of an estimated σ is 1/√(2·redundancy): at most 100 % for weights, where a σ that
+# is assumed instead may be wrong a hundredfold, and 40 % to test points with it.
 MIN_REDUNDANCY = 0.5
 MIN_REDUNDANCY_OF_TEST = 3.0
 
