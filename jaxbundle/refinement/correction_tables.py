@@ -131,12 +131,14 @@ def columns_of_photographs(
 ) -> list[SharedUnknown]:
     """Their unknowns: of every image, and of its camera for the first image."""
     columns, table_of = [], {t.name: t for t in tables}
+    # Rotations about the axes of the camera have the σ that their angles have.
+    sigma_of_image = np.where(np.isnan(network.images.sigma), np.inf, network.images.sigma)
     for i, id in enumerate(network.images.id):
         for k in np.flatnonzero(table_of["image"].free[i]).tolist():
             word = EXTERIOR[k]
             unit = ("m", 1.0) if k < 3 else ("arcsec", ARCSECONDS_PER_RADIAN)
             name = UnknownName(f"photograph {id}", word, *unit, word)
-            columns.append(SharedUnknown(name, math.inf, "image", i, k))
+            columns.append(SharedUnknown(name, float(sigma_of_image[i, k]), "image", i, k))
         c = network.images.camera[i]
         camera, (title, row) = network.cameras[c], of_cameras[network.cameras[c].id]
         if c in network.images.camera[:i]:  # named with its first image

@@ -106,6 +106,24 @@ def test_cameras_are_compared_with_what_was_observed(observed, said):
     assert bool(list(_beyond_priors(result, 0.001))) == said
 
 
+@pytest.mark.parametrize("sigma, said", [(0.1, True), (2.0, False), (np.nan, False)])
+def test_given_positions_of_photographs_are_priors(sigma, said):
+    """A position that comes to lie 5 m away from where it was given with a σ."""
+    nothing, of_image = np.zeros((1, 3)), np.full((1, 6), np.nan)
+    of_image[0, 0] = sigma
+    images = Images(("F",), np.zeros(1, int), nothing, nothing, of_image)
+    tables = [SimpleNamespace(name="image", free=np.eye(6)[:1]),
+              SimpleNamespace(name="brown", free=np.zeros((1, 1)))]  # fmt: skip
+    network = SimpleNamespace(images=images, cameras=(CAMERA,))
+    (column,) = columns_of_photographs(network, tables, {CAMERA.id: ("brown", 0)})
+    result = SimpleNamespace(
+        estimate=np.array([5.0]), prior_change=np.array([column.prior]), names=[column.name],
+        prior_sigma=np.array([column.sigma]),
+    )  # fmt: skip
+    assert column.sigma == (np.inf if np.isnan(sigma) else sigma)
+    assert bool(list(_beyond_priors(result, 0.001))) == said
+
+
 @pytest.mark.parametrize("image, hinted", [([0, 1, 1], False), ([0, 0, 1], True)])
 def test_one_point_of_an_image_does_not_tell_that_columns_are_exchanged(image, hinted):
     xy = np.array([[100.0, 850.0], [200.0, 300.0], [200.0, 300.0]])
