@@ -2,14 +2,16 @@
 
     python benchmarks/reconstruct.py [--set NAME | all] [--photographs N] [--width PIXELS]
                                      [--json FILE] [--folder FOLDER] [--colmap]
+                                     [--pairs auto | sequence]
 
 Photographs of a set (`photograph_sets.py`, `lifelike_sets.py`) are rendered into FOLDER/NAME (kept
 there for the next run), by a camera whose principal distance and distortion are unknown to the
 reconstruction. `--photographs` applies to the set `convergent`. Errors of the projection centres
 are given after a similarity, relative to the distance from their centroid; c in σ. With --colmap
-the incremental mapper of pycolmap, if installed, runs on the same folder in the same process. The
-exit status is 1 if a photograph of a scene is left out or placed in another one, c or a centre is
-more than 4 σ off, or σ0 differs from 1 by more than 2 %.
+the incremental mapper of pycolmap, if installed, runs on the same folder in the same process, and
+matches the same pairs: all, or those of a sequence. Processor times include all threads. The exit
+status is 1 if a photograph of a scene is left out or placed in another one, c or a centre is more
+than 4 σ off, or σ0 differs from 1 by more than 2 %.
 """
 
 import json
@@ -33,6 +35,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.reconstruct import reconstruct
 from jaxbundle.reconstruction.result import ReconstructedPart
+from jaxbundle.reconstruction.settings import ReconstructionSettings
 from jaxbundle.system.cores import allow_programs_at_once
 
 SETS = SETS | LIFELIKE
@@ -71,7 +74,7 @@ def in_parts(truth, ids, e) -> float:
     return float(np.sqrt((e**2).sum(1).mean()) / extent)
 
 
-def ours(folder: Path, truth: dict[str, Shot]) -> dict:
+def ours(folder: Path, truth: dict[str, Shot], pairs: str) -> dict:
     stages, last = {}, ["", time.perf_counter()]
 
     def tell(stage, done, total):
@@ -82,7 +85,7 @@ def ours(folder: Path, truth: dict[str, Shot]) -> dict:
 
     start, processor = time.perf_counter(), time.process_time()
     try:
-        found = reconstruct([folder], progress=tell)
+        found = reconstruct([folder], settings=ReconstructionSettings(pairs=pairs), progress=tell)
     except NotSolvedError as error:
         return {"failed": str(error), "parts": [], "left_out": dict.fromkeys(truth, "")}
     return {
@@ -117,21 +120,24 @@ def of_part(part: ReconstructedPart, truth: dict[str, Shot]) -> dict:
     }  # fmt: skip
 
 
-def colmap(folder: Path, truth: dict[str, Shot]) -> dict | None:
+def colmap(folder: Path, truth: dict[str, Shot], pairs: str) -> dict | None:
     if not machine.installed("pycolmap"):
         return None
     import pycolmap
 
     with tempfile.TemporaryDirectory() as work:
         database = Path(work) / "database.db"
-        start = time.perf_counter()
+        start, processor = time.perf_counter(), time.process_time()
         sizes = {shot.camera.image_size for shot in truth.values()}
         one = len(sizes) == 1 and not any(shot.upright for shot in truth.values())
         mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.AUTO
         pycolmap.extract_features(database, folder, camera_mode=mode)
-        pycolmap.match_exhaustive(database)
+        if pairs == "sequence":
+            pycolmap.match_sequential(database)
+        else:
+            pycolmap.match_exhaustive(database)
         models = pycolmap.incremental_mapping(database, folder, work)
-        seconds = time.perf_counter() - start
+        seconds, processor = time.perf_counter() - start, time.process_time() - processor
         parts = []
         for model in sorted(models.values(), key=lambda m: -m.num_reg_images()):
             images = [model.images[k] for k in model.reg_image_ids()]
@@ -139,16 +145,18 @@ def colmap(folder: Path, truth: dict[str, Shot]) -> dict | None:
             ids = [image.name for image in images]
             parts.append({"photographs": len(ids), "of": sorted({truth[id].part for id in ids}),
                           "centres_rms": in_parts(truth, ids, centre_errors(truth, ids, X0)[1])})
-    return {"seconds": seconds, "parts": parts}
+    return {"seconds": seconds, "processor": processor, "parts": parts}
 
 
-def run(name: str, shots: Sequence[Shot], folder: Path, beside: bool) -> tuple[dict, list[str]]:
+def run(
+    name: str, shots: Sequence[Shot], folder: Path, beside: bool, pairs: str
+) -> tuple[dict, list[str]]:
     """The figures of a set, and their errors."""
     write(shots, folder)
     truth = {shot.name: shot for shot in shots}
-    figures = {"ours": ours(folder, truth)}
+    figures = {"ours": ours(folder, truth, pairs)}
     if beside:
-        figures["pycolmap"] = colmap(folder, truth)
+        figures["pycolmap"] = colmap(folder, truth, pairs)
     found, parts = figures["ours"], figures["ours"]["parts"]
     lost = [id for id in found["left_out"] if truth[id].part]
     wrong = [
@@ -174,6 +182,7 @@ def main():
     parser.add_argument("--width", type=machine.positive)
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--colmap", action="store_true")
+    parser.add_argument("--pairs", choices=("auto", "sequence"), default="auto")
     parser.add_argument("--json", type=machine.target, metavar="FILE")
     given = parser.parse_args()
     allow_programs_at_once()
@@ -188,7 +197,7 @@ def main():
             else:
                 shots, folder = SETS[name](given.width or WIDTH), f"{name}_{given.width or WIDTH}"
             place = (given.folder or Path(temporary)) / folder
-            figures[name], bad = run(name, shots, place, given.colmap)
+            figures[name], bad = run(name, shots, place, given.colmap, given.pairs)
             print(json.dumps({name: figures[name]}, indent=1, ensure_ascii=False), flush=True)
             wrong += bad
     machine.write_json(figures, given.json)

@@ -131,8 +131,9 @@ def columns_of_photographs(
 ) -> list[SharedUnknown]:
     """Their unknowns: of every image, and of its camera for the first image."""
     columns, table_of = [], {t.name: t for t in tables}
-    # Rotations about the axes of the camera have the σ that their angles have.
     sigma_of_image = np.where(np.isnan(network.images.sigma), np.inf, network.images.sigma)
+    # Unknowns are rotations about the axes of the camera, which mix ω, φ and κ.
+    sigma_of_image[:, 3:] = sigma_of_image[:, 3:].max(1, keepdims=True)
     for i, id in enumerate(network.images.id):
         for k in np.flatnonzero(table_of["image"].free[i]).tolist():
             word = EXTERIOR[k]
