@@ -27,7 +27,7 @@ from jaxbundle.network.columns import list_some
 from jaxbundle.network.equation_counts import equations_of
 from jaxbundle.network.noise import noise_of_rays
 from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
-from jaxbundle.network.tables import LeftOut, Network
+from jaxbundle.network.tables import LeftOut, Network, are_among
 from jaxbundle.orientation import batched
 from jaxbundle.orientation.collinear import rays_coincide, see_collinear_points
 from jaxbundle.orientation.incremental import (
@@ -252,9 +252,7 @@ def readmit(
     **Arguments:** `current`: the part of `network_as_given` that was adjusted, with its check
     points; `factor`: σ0."""
     sighted, model, straight = _place_left_out(network_as_given, problem, values, factor)
-    was_adjusted = np.isin(
-        np.array(network_as_given.points.id, object), np.array(current.points.id, object)
-    )
+    was_adjusted = are_among(network_as_given.points.id, current.points.id)
     # An image point that was adjusted stays, even if it misses: its residual is judged by the
     # tests. Only what was left out has to agree first.
     is_used = _are_among(network_as_given, current)

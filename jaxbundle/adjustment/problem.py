@@ -27,7 +27,7 @@ from jaxbundle.network.kinds.base import included_tables
 from jaxbundle.network.kinds.image_points import image_coordinates
 from jaxbundle.network.retraction import TurnAboutSeen, control_is_weak
 from jaxbundle.network.subsets import split_check_points
-from jaxbundle.network.tables import Network, require_network
+from jaxbundle.network.tables import Network, are_among, require_network
 from jaxbundle.types import AnyArray, not_none
 
 NEGLIGIBLE_MOTION = 1e-6
@@ -323,7 +323,7 @@ def _datum_points(network: Network) -> Bool[np.ndarray, " points"]:
     """Which points carry the datum if it is open."""
     points = network.points
     if network.datum_points:
-        return np.isin(np.array(points.id, dtype=object), network.datum_points)
+        return are_among(points.id, network.datum_points)
     # All tie points: the trace of their covariance is then the smallest of all datums.
     # Control points are weighted by their σ and carry none, unless there is nothing else.
     carries_datum = points.has_role("tie")

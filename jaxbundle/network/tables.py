@@ -108,6 +108,13 @@ def units_of(cameras: Iterable[Camera]) -> str:
     return "/".join(sorted({get_model(camera.model).unit for camera in cameras}))
 
 
+def are_among(ids: Sequence[str], chosen: Iterable[str]) -> Bool[np.ndarray, " ids"]:
+    """Which ids are among some: `np.isin` compares ids of any length, as objects, each with each,
+    a second for the 8000 points of a block."""
+    chosen = set(chosen)
+    return np.array([id in chosen for id in ids], bool)
+
+
 def _fill_masked(table: Any) -> None:
     """Masked numbers become NaN, which the checks refuse with their row. Arrays that JAX traces are
     refused: tables are of the host."""

@@ -24,7 +24,7 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.network.subsets import keep_points
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Network, are_among
 from jaxbundle.orientation.network import find_start_values
 from jaxbundle.reconstruction.datum import choose_datum_points
 
@@ -273,7 +273,7 @@ def _are_determined(network: Network, undetermined: Iterable[str]) -> Bool[np.nd
     # As `leastsquares.quality.names` writes them: "X of point 17".
     undetermined_ids = {name.partition(" of point ")[2] for name in undetermined}
     tie = network.points.has_role("tie")
-    return ~(tie & np.isin(np.array(network.points.id, object), [*undetermined_ids]))
+    return ~(tie & are_among(network.points.id, undetermined_ids))
 
 
 def _weight(

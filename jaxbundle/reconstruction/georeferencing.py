@@ -22,7 +22,7 @@ from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.tables import Points
+from jaxbundle.network.tables import Points, are_among
 from jaxbundle.reconstruction.adjusting import WeightedAdjustment, adjust_determined
 from jaxbundle.reconstruction.block import camera_positions
 from jaxbundle.reconstruction.control_choice import (
@@ -208,7 +208,7 @@ def _predict(
 def _predict_rays(result: Adjustment, control: Points) -> dict[tuple[str, str], tuple]:
     """Distance and σ of the prediction of the image measurements that take part, pixels."""
     problem = result.problem
-    is_control = np.isin(np.array(problem.network.points.id, object), control.id)
+    is_control = are_among(problem.network.points.id, control.id)
     rays = np.flatnonzero(is_control[problem.point])
     names, error, sigma, _ = predict_measurements(result.inspection, result.sigma0, rays)
     scale = dict(zip(problem.network.images.id, _pixels(result)))
