@@ -38,9 +38,7 @@ from jaxbundle.leastsquares.quality.distributions import (
 MAX_POINTS_FOR_PAIRS = 20
 # Control points that remain at least: three of a similarity always nearly agree.
 MIN_AGREEING = 4
-# The relative σ of an estimated σ is 1/√(2·redundancy): at most 100 % for weights, where a σ that
-# is assumed instead may be wrong a hundredfold, and 40 % to test points with it.
-MIN_REDUNDANCY = 0.5
+# Of an estimated σ that tests points: its relative σ is 1/√(2·redundancy), 40 %.
 MIN_REDUNDANCY_OF_TEST = 3.0
 
 
@@ -310,8 +308,9 @@ def _resolve(
                 )
         if np.abs(sigma[is_unknown] / previous_sigma[is_unknown] - 1).max() < 1e-3:
             break
+    # For weights a relative σ of 100 % does: an assumed σ may be wrong a hundredfold.
     plane, height = (
-        bool(g.any()) and (r < MIN_REDUNDANCY or bool(np.all(sigma[g] <= assumed)))
+        bool(g.any()) and (r < 0.5 or bool(np.all(sigma[g] <= assumed)))
         for g, r in zip(groups, redundancy)
     )
     for group, is_assumed in zip(groups, (plane, height)):

@@ -6,11 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.orientation.control_consistency import (
-    MIN_REDUNDANCY,
-    MIN_REDUNDANCY_OF_TEST,
-    Assessment,
-)
+from jaxbundle.orientation.control_consistency import MIN_REDUNDANCY_OF_TEST, Assessment
 from jaxbundle.report.layout import column_decimals, fixed, significant
 
 # The columns of the table; d: adjusted minus given; px: RMS distance of the projected point from
@@ -191,14 +187,9 @@ def describe_sigma(
         if name == "in height" and heights_as_in_plane:
             how = "as in the plane: heights that are all 0 are not taken for better ones"
         elif assessed.assumed[part]:
-            why = (
-                "too few control points to estimate it"
-                if r < MIN_REDUNDANCY
-                else "its residuals do not show a larger one"
-            )
             how = (
-                f"assumed, {assumed_pixels:g} pixels on the ground, because {why} (state it with "
-                "--control-sigma)"
+                f"assumed, {assumed_pixels:g} pixels on the ground, because its residuals do not "
+                "show a larger one (state it with --control-sigma)"
             )
         else:
             how = f"estimated from the residuals of control (redundancy {r:.1f}"
