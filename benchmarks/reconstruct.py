@@ -9,9 +9,9 @@ there for the next run), by a camera whose principal distance and distortion are
 reconstruction. `--photographs` applies to the set `convergent`. Errors of the projection centres
 are given after a similarity, relative to the distance from their centroid; c in σ. With --colmap
 the incremental mapper of pycolmap, if installed, runs on the same folder in the same process, and
-matches the same pairs: all, or those of a sequence. Processor times include all threads. The exit
-status is 1 if a photograph of a scene is left out or placed in another one, c or a centre is more
-than 4 σ off, or σ0 differs from 1 by more than 2 %.
+matches the same pairs: all, or five neighbours on each side with `--pairs sequence`. Processor
+times include all threads. The exit status is 1 if a photograph of a scene is left out or placed in
+another one, c or a centre is more than 4 σ off, or σ0 differs from 1 by more than 2 %.
 """
 
 import json
@@ -37,6 +37,7 @@ from jaxbundle.reconstruction.reconstruct import reconstruct
 from jaxbundle.reconstruction.result import ReconstructedPart
 from jaxbundle.reconstruction.settings import ReconstructionSettings
 from jaxbundle.system.cores import allow_programs_at_once
+from jaxbundle.tiepoints.pairs import CandidateSettings
 
 SETS = SETS | LIFELIKE
 LIMIT = 4.0
@@ -133,7 +134,10 @@ def colmap(folder: Path, truth: dict[str, Shot], pairs: str) -> dict | None:
         mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.AUTO
         pycolmap.extract_features(database, folder, camera_mode=mode)
         if pairs == "sequence":
-            pycolmap.match_sequential(database)
+            options = pycolmap.SequentialPairingOptions()
+            options.overlap = CandidateSettings().sequence_neighbours
+            options.quadratic_overlap = False
+            pycolmap.match_sequential(database, pairing_options=options)
         else:
             pycolmap.match_exhaustive(database)
         models = pycolmap.incremental_mapping(database, folder, work)

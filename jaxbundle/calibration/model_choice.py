@@ -49,7 +49,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
-from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.tables import Camera, Network, are_among
 from jaxbundle.results import TableMethods
 from jaxbundle.types import Progress
 
@@ -306,7 +306,7 @@ def _candidate(
     network = result.problem.network
     keep = np.array([pair not in gross for pair in _ids(network)])
     network = start_at_result(network, result, keep)
-    network = take_images(network, np.isin(np.array(network.images.id, object), common))
+    network = take_images(network, are_among(network.images.id, common))
     camera = network.cameras[0]
     readjusted = adjust(network)
     if not readjusted.converged:

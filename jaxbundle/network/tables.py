@@ -109,8 +109,8 @@ def units_of(cameras: Iterable[Camera]) -> str:
 
 
 def are_among(ids: Sequence[str], chosen: Iterable[str]) -> Bool[np.ndarray, " ids"]:
-    """Which ids are among some: `np.isin` compares ids of any length, as objects, each with each,
-    a second for the 8000 points of a block."""
+    """Which ids are among some. (`np.isin` compares arrays of objects each with each, which takes
+    seconds for the points of a large block.)"""
     chosen = set(chosen)
     return np.array([id in chosen for id in ids], bool)
 

@@ -10,7 +10,7 @@ from jaxbundle.cameras.convert import image_area
 from jaxbundle.cameras.convert_fit import rays_of
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Network, are_among
 from jaxbundle.plotting.frame import pyramid_lines
 from jaxbundle.plotting.style import (
     BLUE,
@@ -52,7 +52,7 @@ def network_view(
     everything = np.concatenate([*places, *boxes])
     centre, size = extent(everything)
     network = both_networks[after]
-    new = np.isin(np.array(network.images.id, dtype=object), designed.added)
+    new = are_among(network.images.id, designed.added)
     for is_of_kind, colour, name in ((~new, INK, "stations"), (new, RUST, "new photograph")):
         if is_of_kind.any():
             lines = camera_lines(network, camera_size * size)[is_of_kind].reshape(-1, 2, 3)
@@ -139,7 +139,7 @@ def places_tried(designed: "Design", ax: "Axes | None" = None) -> "Axes":
     network, good = designed.network, aims < 1e3 * np.min(aims)
     marks = ax.scatter(*position[good, :2].T, c=aims[good], norm=LogNorm(), s=26, cmap="viridis_r")
     ax.figure.colorbar(marks, ax=ax, label=f"{designed.aim} with a photograph there")
-    new = np.isin(np.array(network.images.id, dtype=object), designed.added)
+    new = are_among(network.images.id, designed.added)
     ax.scatter(*network.points.position[:, :2].T, s=9, color=BLUE, label="targets")
     ax.scatter(*network.images.position[~new, :2].T, s=34, color=INK, marker="^", label="stations")
     ax.scatter(*network.images.position[new, :2].T, s=120, color=RUST, marker="*", label="chosen")
