@@ -7,6 +7,7 @@ from typing import cast
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.minimum import inspect_solution, require_solved
 from jaxbundle.adjustment.problem import NetworkProblem
@@ -27,7 +28,13 @@ from jaxbundle.leastsquares.quality.robust import (
     reweight,
     robust_scale,
 )
-from jaxbundle.leastsquares.quality.snooping import RemovedRow, snoop, without
+from jaxbundle.leastsquares.quality.snooping import (
+    RemovedRow,
+    readjust,
+    snoop,
+    solve_without,
+    without,
+)
 from jaxbundle.leastsquares.quality.variance_components import (
     ROUNDS,
     Component,
@@ -79,6 +86,30 @@ def snoop_network(
             significance,
         )
     return cast(NetworkProblem, solution.problem), repeat.minimum, removed, doubt
+
+
+def values_without(
+    result: Adjustment,
+    values: Values,
+    sigma_factor: Float[np.ndarray, " rays"],
+    is_left_out: Bool[np.ndarray, " rays"],
+    minimise_again: Minimise,
+) -> Values:
+    """Where the adjustment of a result ends, from values near to it, without some image points and
+    with the σ of the others times a factor; in a large network after a single step.
+
+    **Raises:** `NotSolvedError`."""
+    problem = result.problem
+    weight = problem.image_weights / sigma_factor[:, None]
+    reweighted = with_data(problem, problem.with_image_weights(problem.data, weight))
+    left_out = [
+        RemovedRow(name, int(row), None, np.inf)
+        for name, places in problem.image_rows.items()
+        for row in np.flatnonzero(is_left_out[places])
+    ]
+    repeat = _Repeat(minimise_again, "without gross errors", result.minimum)
+    step = lambda problem, values: readjust(problem, values, repeat)
+    return solve_without(reweighted, left_out, set(), values, step).values
 
 
 def _scale_of_good(solution: Solution, repeat: "_Repeat") -> float:

@@ -8,18 +8,24 @@
 
    over the measurements whose normalised residual v/(σ·√r) is below `gross_residual`·f. (2n
    coordinates determine 3 of the point; what they add to images and cameras is neglected.)
+   Measurements with residuals above `suspect_residual`·f are gross errors, most likely: 2. again
+   without them, until they are the same ones.
 3. Data snooping, and 2. again for the remaining measurements, with their redundancy numbers, until
    the factors converge.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.far_points import minimise_holding_infinite_points
+from jaxbundle.adjustment.quality.inspection import Inspection
+from jaxbundle.adjustment.readjust import values_without
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
@@ -46,6 +52,10 @@ class WeightingSettings:
     """Normalised residual, in factors of its class, above which an image point is excluded when
     data snooping begins, with a probability of 6e-7; snooping restores it if it agrees. Smaller:
     more to restore; larger: more rounds until all gross errors are found."""
+    max_screenings: int = 10
+    """Maximum number of times that factors and suspects are determined before data snooping. In 60
+    frames of a video the first factors are up to 2.7 times too large, those of the tenth time right
+    to 6 %; data snooping then has two rounds instead of four, and 23 adjustments instead of 67."""
     last_change: float = 0.004
     """Relative change of a factor that ends the rounds: less than its own σ, 1/√(2·Σr), unless a
     class has more than 30 000 measurements."""
@@ -290,15 +300,9 @@ def _weight(
     measurement_class, sigma = measurement_class[is_kept], network.observations.sigma
     factor_so_far, suspects = np.ones(len(is_kept)), []
     if result.converged:
-        (v, r), rows = _approximate_redundancy(result), _rows(result, network)
-        factor_so_far[rows] = _factors(
-            v, r, measurement_class[rows], settings, settings.gross_residual
-        )
-        # r ≥ 1/4 for two rays; one ray, r < 0, is judged like those that are hardly checked
-        beyond = np.abs(v) / np.sqrt(np.maximum(r, 0.1)) > (
-            settings.suspect_residual * factor_so_far[rows, None]
-        )
-        suspects = _pairs_of_ids(result, np.any(beyond, axis=1))
+        rows = _rows(result, network)
+        factor_so_far[rows], is_suspect = _screen(result, measurement_class[rows], settings)
+        suspects = _pairs_of_ids(result, is_suspect)
         # Once: a datum that changes with each round would change all σ, too.
         network = network.replace(datum_points=choose_datum_points(result))
     for rounds_left in reversed(range(settings.max_rounds)):
@@ -331,6 +335,40 @@ def _weight(
         if (measurement_class == k).any()
     }
     return WeightedAdjustment(result, factors, int(result.problem.used.sum()))
+
+
+def _screen(
+    result: Adjustment, measurement_class: Int[np.ndarray, " rays"], settings: WeightingSettings
+) -> tuple[Float[np.ndarray, " rays"], Bool[np.ndarray, " rays"]]:
+    """The factor of σ of every ray, and which are excluded when data snooping begins, from
+    residuals without these: gross errors distort all others as long as they take part."""
+    problem, values = result.problem, result.values
+    minimise_again = partial(
+        minimise_holding_infinite_points, max_steps=limit_iterations(result.network)
+    )
+    (v, r), point = _approximate_redundancy(result), problem.point
+    # r ≥ 1/4 for two rays; one ray, r < 0, is judged like those that are hardly checked
+    root = np.sqrt(np.maximum(r, 0.1))
+    are_two = (np.bincount(point) == 2)[point]
+    is_suspect = np.zeros(len(v), bool)
+    for rounds_left in reversed(range(settings.max_screenings)):
+        factor = _factors(v, r, measurement_class, settings, settings.gross_residual)
+        excess = np.max(np.abs(v) / root, axis=1) / (settings.suspect_residual * factor)
+        # Of every point the worst ray, which may have moved the point and so spoil the others; of
+        # two rays both, as nothing decides between them. A suspect that fits after all returns.
+        is_new = ~is_suspect & (excess > 1)
+        worst = np.zeros(point.max(initial=-1) + 1)
+        np.maximum.at(worst, point[is_new], excess[is_new])
+        was_suspect = is_suspect
+        is_suspect = (is_suspect & (excess > 1)) | (is_new & (are_two | (excess == worst[point])))
+        if not rounds_left or (is_suspect == was_suspect).all():
+            break
+        try:
+            values = values_without(result, values, factor, is_suspect, minimise_again)
+        except NotSolvedError:
+            break
+        v = Inspection(problem, values).image_residuals
+    return factor, is_suspect
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:

@@ -123,7 +123,7 @@ def snoop(
     removed, restored = [*doubtful], set()
     excluded: set[int] = set()
     if removed:
-        solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
+        solution = solve_without(full_problem, removed, excluded, solution.values, adjust_from)
     # τ has f − 1 degrees of freedom.
     while solution.problem.counts.redundancy >= 2:
         if test == "pope" and solution.sigma0 < ROUNDING_SIGMA:
@@ -153,7 +153,7 @@ def snoop(
             restored |= passing
             removed = still_removed
         readjust_from = lambda problem, values: readjust(problem, values, adjust_from)
-        solution = _solve(full_problem, removed, excluded, solution.values, readjust_from)
+        solution = solve_without(full_problem, removed, excluded, solution.values, readjust_from)
     if doubtful:
         # The tests of those that were doubtful from the beginning.
         unit = _unit_of_tests(solution, test)
@@ -161,7 +161,7 @@ def snoop(
         of_unknown = lambda r, tests: r.test if np.isfinite(r.test) else max(tests) / unit
         removed = [dataclasses.replace(r, test=of_unknown(r, tests)) for r, tests in tested]
     if removed:
-        solution = _solve(full_problem, removed, excluded, solution.values, adjust_from)
+        solution = solve_without(full_problem, removed, excluded, solution.values, adjust_from)
     return solution, removed
 
 
@@ -170,7 +170,7 @@ def _unit_of_tests(solution: Solution, test: str) -> float:
     return solution.sigma0 if test == "pope" and solution.sigma0 > 0 else 1.0
 
 
-def _solve(
+def solve_without(
     full_problem: Problem,
     removed: Sequence[RemovedRow],
     excluded: set[int],
