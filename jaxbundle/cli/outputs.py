@@ -32,7 +32,7 @@ from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.io.results.result_json import json_text, result_text, unsolved_text
 from jaxbundle.io.results.result_project import readjustable_network
 from jaxbundle.io.text.csv_tables import table_rows, write_bytes, write_csv, write_text
-from jaxbundle.io.writing.folders import check_folder, replace_folder
+from jaxbundle.io.writing.folders import check_folder, keep_inputs, replace_folder
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
@@ -175,11 +175,7 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
             raise InputError(f"{option} {file}: there is no folder {path.parent}")
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise InputError(f"{option} {file}: cannot be written: no permission in {path.parent}")
-    # By real paths: an input may be named through a link.
-    if any(str(real) == os.path.realpath(input_file) for input_file in inputs):
-        raise InputError(
-            f"{option} {file}: is part of the input and would be overwritten; give another"
-        )
+    keep_inputs(f"{option} {file}", path, inputs)
 
 
 def check_json_target(json: str, inputs: Iterable[str | Path]) -> None:

@@ -25,10 +25,12 @@ from jaxbundle.io.rasters.correction import Correction, map_of, write_corrected
 from jaxbundle.io.rasters.error_maps import write_error_map, write_sigma_map
 from jaxbundle.io.rasters.map_blocks import MapFormat
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, describe_distance
+from jaxbundle.io.rasters.mosaics import tiles_in
 from jaxbundle.io.scanner.rpc import read_stated_errors
 from jaxbundle.io.scanner.rpc_images import IMAGES, RpcInput, find_coefficients
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.writing.fingerprints import files_read, of_words
+from jaxbundle.io.writing.folders import keep_inputs
 from jaxbundle.io.writing.replacing import remove_left_behind
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.pushbroom.ground_to_image import make_search
@@ -280,14 +282,14 @@ def _fingerprint(
 
 
 def _input_files(scanner: str | Path, *sources: str | Path | None) -> list[Path]:
-    """The files of the scanner, and of sources, those of folders among them."""
+    """The files of the scanner, and of sources, tiles of folders among them."""
     files = files_read(scanner)
     if Path(scanner).suffix.lower() in IMAGES:
         files.append(find_coefficients(Path(scanner)))
     for source in sources:
         if source is not None and os.path.exists(source):
-            folder = Path(source)
-            files += sorted(folder.iterdir()) if folder.is_dir() else [folder]
+            path = Path(source)
+            files += tiles_in(path) if path.is_dir() else [path]
     return files
 
 
@@ -302,7 +304,6 @@ def _raster_of(scanner: str | Path, image: str | Path | None) -> Path:
 
 def _check_targets(targets: Mapping[str, Path], image: Path, inputs: Sequence[Path]) -> None:
     """Refuse outputs that cannot be written, or would replace an input, before computing."""
-    real_inputs = {os.path.realpath(file) for file in inputs}
     option_of: dict[Path, str] = {}
     for option, path in targets.items():
         if not path.absolute().parent.is_dir():
@@ -313,10 +314,7 @@ def _check_targets(targets: Mapping[str, Path], image: Path, inputs: Sequence[Pa
             )
         if path.exists() and path.samefile(image):
             raise InputError(f"{option} {path} is the image itself; give another name")
-        if os.path.realpath(path) in real_inputs:
-            raise InputError(
-                f"{option} {path}: is part of the input and would be overwritten; give another"
-            )
+        keep_inputs(f"{option} {path}", path, inputs)
         earlier_option = option_of.setdefault(Path(os.path.realpath(path)), option)
         if earlier_option != option:
             raise InputError(f"{option} {path} is also {earlier_option}; give another name")

@@ -9,7 +9,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.cli.outputs import check_targets, write_targets
-from jaxbundle.cli.pushbroom.shared import keep_inputs
+from jaxbundle.cli.pushbroom.shared import check_outputs
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import MARKER
@@ -62,7 +62,7 @@ def test_only_json_gives_way_to_json(network, tmp_path, text):
     check_targets(EXAMPLE, network, str(target), None, force=True)
     assert target.read_text() == text
     with pytest.raises(InputError, match=f"{said}$"):
-        keep_inputs([], csv=target, json=str(target))  # of the commands without --force
+        check_outputs([], csv=target, json=str(target))  # of the commands without --force
 
 
 def test_tables_and_figures_are_checked_before_the_work(command, tmp_path):
@@ -82,7 +82,15 @@ def test_tables_and_figures_are_checked_before_the_work(command, tmp_path):
         assert told.status == 2 and re.search(why, told.err), told.err
         assert [file.read_text() for file in (camera, cloud, sigma)] == before
     with pytest.raises(InputError, match="--csv .*there is no folder"):
-        keep_inputs([], csv=tmp_path / "no" / "a.csv")
+        check_outputs([], csv=tmp_path / "no" / "a.csv")
+
+
+def test_tiles_of_a_terrain_are_inputs_and_what_lies_beside_them_is_not(tmp_path):
+    (tmp_path / "n50.tif").write_text("a tile")
+    (tmp_path / "heights.csv").write_text("of an earlier run")
+    check_outputs([tmp_path], csv=tmp_path / "heights.csv")
+    with pytest.raises(InputError, match="--csv .*n50.tif: is part of the input"):
+        check_outputs([tmp_path], csv=tmp_path / "n50.tif")
 
 
 @pytest.mark.parametrize("text", ["", "{}", ' {\n "a": 1}', "[]", "[\n[-1", '[{"a', "[ null]"])

@@ -351,7 +351,9 @@ def cubic_splines(
 ) -> Float[AnyArray, "*points number"]:
     """Cubic B-splines of a number − 3 of equal intervals over 0 … 1."""
     d = abs((place * (number - 3))[..., None] - (np.arange(number) - 1.0))
-    return ((2 - d).clip(0) ** 3 - 4 * (1 - d).clip(0) ** 3) / 6
+    # Products: a power of 3 takes NumPy ten times as long.
+    outer, inner = (2 - d).clip(0), (1 - d).clip(0)
+    return (outer * outer * outer - 4 * inner * inner * inner) / 6
 
 
 def root_of_octaves(settings: CorrelationSettings) -> Float[np.ndarray, "splines splines"]:

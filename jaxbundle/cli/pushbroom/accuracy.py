@@ -78,10 +78,10 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
     from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
     from jaxbundle.cli.pushbroom.places import grid_of
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn, write_rows
 
     check_accept(accept, "pushbroom accuracy")
-    keep_inputs([scanner, truth, dem, geoid], csv=csv, json=json, map=map_)
+    check_outputs([scanner, truth, dem, geoid], csv=csv, json=json, map=map_)
     if map_ is not None:
         _check_map(map_, table)
     if table:

@@ -81,10 +81,10 @@ def correct(  # noqa: PLR0913 - the options of the command
     """Correct an image to a map, in blocks."""
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.progress import staging
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn
 
     outputs = {"out": out, "error_map": error_map, "sigma": sigma, "checkpoint": checkpoint}
-    keep_inputs([scanner, image, dem, geoid, truth], **outputs)
+    check_outputs([scanner, image, dem, geoid, truth], **outputs)
     errors = _errors(error or [])
     if checkpoint is not None:
         advise(f"run the same command again to resume; finished blocks are kept in {checkpoint}")

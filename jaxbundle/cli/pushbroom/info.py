@@ -8,7 +8,7 @@ def info(scanner: ImageFile, height: Level = None, json: Json = "") -> None:
     """Size, ground sampling, view, footprint, corrections; agreement with the RPC of a product."""
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.outputs import print_result
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn
 
-    keep_inputs([scanner], json=json)
+    check_outputs([scanner], json=json)
     print_result(line_scanners.info(scanner, height=height, tell=warn), json)

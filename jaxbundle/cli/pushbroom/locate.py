@@ -24,9 +24,9 @@ def locate(
     """Locate image positions on the ground; (0, 0) is the centre of the first pixel."""
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.pushbroom.places import grid_of
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn, write_rows
 
-    keep_inputs([scanner, points, dem, geoid], csv=csv, json=json)
+    check_outputs([scanner, points, dem, geoid], csv=csv, json=json)
     located = line_scanners.locate(
         scanner,
         points=points,

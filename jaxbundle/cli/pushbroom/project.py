@@ -19,8 +19,8 @@ def project(
 ) -> None:
     """Project ground points into the image: a row for every line that sees one."""
     from jaxbundle import pushbroom as line_scanners
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn, write_rows
 
-    keep_inputs([scanner, points], csv=csv, json=json)
+    check_outputs([scanner, points], csv=csv, json=json)
     projected = line_scanners.project(scanner, points, tell=warn)
     write_rows(projected.columns, csv, json, projected.figures)

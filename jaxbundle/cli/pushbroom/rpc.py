@@ -42,10 +42,10 @@ def fit(
     """Fit coefficients to a scanner or a table; print the residuals in pixels."""
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn, write_rows
 
     check_accept(accept, "pushbroom rpc fit")
-    keep_inputs([source], out=out, json=json)
+    check_outputs([source], out=out, json=json)
     fitted = line_scanners.rpc.fit(source, heights=_heights(heights), ridge=ridge, tell=warn)
     fitted.write(out)
     acceptance = accept_result(fitted, accept)
@@ -71,9 +71,9 @@ def apply(
 ) -> None:
     """Project ground points to the image, or locate image positions on a surface."""
     from jaxbundle import pushbroom as line_scanners
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn, write_rows
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn, write_rows
 
-    keep_inputs([coefficients, points, dem, geoid], csv=csv, json=json)
+    check_outputs([coefficients, points, dem, geoid], csv=csv, json=json)
     applied = line_scanners.rpc.apply(
         coefficients, points, height=height, dem=dem, geoid=geoid, tell=warn
     )
@@ -110,13 +110,13 @@ def compensate(  # noqa: PLR0913 - the options of the command
     """Remove the bias found by control points; print residuals, redundancy numbers and w."""
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, write_rows
+    from jaxbundle.cli.pushbroom.shared import check_outputs, write_rows
     from jaxbundle.io.scanner.rpc import RASTERS
 
     check_accept(accept, "pushbroom rpc compensate")
     # The tags of a raster may be replaced in place.
-    keep_inputs([control, geoid], out=out, csv=csv, json=json)
-    keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
+    check_outputs([control, geoid], out=out, csv=csv, json=json)
+    check_outputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     compensated = line_scanners.rpc.compensate(
         coefficients,
         control,

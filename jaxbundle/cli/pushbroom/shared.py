@@ -13,6 +13,7 @@ from jaxbundle.commands.scanner_inputs import check_spheroid as check_spheroid
 from jaxbundle.commands.scanner_inputs import geographic as geographic
 from jaxbundle.commands.scanner_inputs import open_scanner as read_scanner_file
 from jaxbundle.commands.scanner_inputs import surface_of as surface_of
+from jaxbundle.io.rasters.mosaics import tiles_in
 from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.io.scanner.scanner import ScannerInput
 from jaxbundle.io.text.csv_tables import write_csv, write_text
@@ -29,10 +30,13 @@ def open_scanner(path: Path) -> ScannerInput:
     return read_scanner_file(path, warn)
 
 
-def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
-    """Refuse an output file, by option name, that cannot be written or is an input; for JSON,
-    `check_json`."""
-    input_files = [file for path in inputs if path for file in files_read(path)]
+def check_outputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
+    """Refuse an output file, by option name, that cannot be written or is an input, such as a tile
+    of a terrain; for JSON, `check_json`."""
+    given = [Path(path) for path in inputs if path]
+    input_files = [
+        file for path in given for file in (tiles_in(path) if path.is_dir() else files_read(path))
+    ]
     for option, path in outputs.items():
         check_file(f"--{option.replace('_', '-')}", str(path or ""), None, input_files)
     check_json(str(outputs.get("json") or ""))

@@ -25,10 +25,10 @@ def tie(
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.outputs import print_result
     from jaxbundle.cli.progress import staging
-    from jaxbundle.cli.pushbroom.shared import keep_inputs, warn
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn
     from jaxbundle.io.text.csv_tables import table_rows, write_csv
 
-    keep_inputs([input], out=out, json=json)
+    check_outputs([input], out=out, json=json)
     with staging(quiet or json == "-") as show:
         result = line_scanners.tie(
             input, spacing=spacing, zmin=zmin, zmax=zmax, progress=show, tell=warn

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 TILES = (".tif", ".tiff", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".asc", ".bil", ".vrt")
 
 
+def tiles_in(folder: Path) -> list[Path]:
+    """The terrain tiles in a folder, in the order of their names."""
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in TILES)
+
+
 @contextmanager
 def as_one_raster(path: str | Path) -> Iterator[Path]:
     """The raster itself, or a virtual one of all tiles in a folder.
@@ -32,7 +37,7 @@ def as_one_raster(path: str | Path) -> Iterator[Path]:
     if not path.is_dir():
         yield path
         return
-    tiles = sorted(p for p in path.iterdir() if p.suffix.lower() in TILES)
+    tiles = tiles_in(path)
     if not tiles:
         raise InputError(f"{path}: no terrain tiles in this folder: {', '.join(TILES)}")
     text = _virtual_raster(tiles)

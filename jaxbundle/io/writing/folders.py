@@ -74,6 +74,15 @@ def check_folder(
         _refuse_foreign_files(folder, real_folder, command, names, subject)
 
 
+def keep_inputs(subject: str, file: Path, inputs: Iterable[str | Path]) -> None:
+    """Refuse a file to write that is an input, by real paths: an input may be named through a link.
+
+    **Raises:** `InputError`, which begins with `subject`."""
+    real = os.path.realpath(file)
+    if any(real == os.path.realpath(input_file) for input_file in inputs):
+        raise InputError(f"{subject}: is part of the input and would be overwritten; give another")
+
+
 @contextmanager
 def replace_folder(
     folder: str | Path, command: str, names: Iterable[str], force: bool = False
