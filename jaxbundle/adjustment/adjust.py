@@ -151,7 +151,12 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
         as_network(network, format=format, overrides=overrides, control=control, check=check)
     )
     # One step more: the first evaluation is of the start values.
-    options: dict[str, Any] = {"search": SEARCHES[method], "max_steps": max_iterations + 1}
+    max_steps = max_iterations + 1
+    options: dict[str, Any] = {
+        "search": SEARCHES[method],
+        "max_steps": max_steps,
+        "largest_max_steps": max_steps,
+    }
     try_again = partial(_try_mirrored, reduction, options)
     mirror = lambda sigma0: name_mirrored(given, sigma0, try_again, largest_sigma0(given))
     oriented = _orient(given, mirror) if lacks_start_values(given) else None

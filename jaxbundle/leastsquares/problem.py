@@ -500,18 +500,29 @@ def _shapes_by_name(data: Data) -> dict[str, tuple[int, ...]]:
     return {jax.tree_util.keystr(path): jnp.shape(x) for path, x in leaves}
 
 
+HISTORY_ROWS = (128, 2048, 10_000)
+"""Rows of the history of a search, which are compiled in: for the 100 steps of an adjustment, the
+2000 of a reconstruction with an unknown camera, and the most that are recorded, since three arrays
+of them are kept on every device."""
+
+
 def make_solver(
-    problem: Problem, *, atol: float = 1e-5, rtol: float = 0.0, max_steps: int = 100, **options: Any
+    problem: Problem,
+    *,
+    atol: float = 1e-5,
+    rtol: float = 0.0,
+    max_steps: int = 100,
+    largest_max_steps: int = 0,
+    **options: Any,
 ) -> LeastSquares:
-    """The solver of a problem; `options` are those of `LeastSquares`. Different step limits share
-    its program."""
+    """The solver of a problem; `options` are those of `LeastSquares`. Searches of one
+    `largest_max_steps` share its program, whatever their `max_steps`."""
     data = problem.data
     squares = sum(_measured_squares(w, data.measured[o]) for o, w in data.weight.items())
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
-    # The rows of the history are compiled in: all limits below 128 steps share a program. Steps
-    # after the first 10 000, which would be kept in three arrays on every device, are not recorded.
-    rows = round_up(min(max(max_steps + 1, 128), 10_000))
+    limit = max(max_steps, largest_max_steps)
+    rows = next((rows for rows in HISTORY_ROWS if limit < rows), HISTORY_ROWS[-1])
     return LeastSquares(
         problem.declared,
         problem.plan,
