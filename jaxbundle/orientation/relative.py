@@ -108,6 +108,7 @@ def relative_orientation(
     return RelativeOrientation(M, b, fit.vtpv, fit.cofactor, front, flat & ~no_base, status)
 
 
+@jax.jit
 def sampson_distance(
     M: Float[AnyArray, "3 3"],
     b: Float[AnyArray, "3"],
@@ -193,6 +194,7 @@ def coplanarity_misclosures(
     return sqrt_weight * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
 
+@jax.jit
 def retract(pair: Motion, delta: Float[AnyArray, "5"]) -> Motion:
     """A pair (M, b) turned by δ[:3] in the frame of the second camera, its base moved by δ[3:]."""
     M, b = pair

@@ -239,6 +239,8 @@ def _self_calibrate(
         r, s, w = image_ray(model, tuple(q), xy[0], xy[1])
         return jnp.stack([-r / w, -s / w])
 
+    # Traced once for the three uses below.
+    @jax.jit
     def misclosures(
         state: State,
         xy1: Float[Array, "pairs slots 2"],
@@ -247,7 +249,9 @@ def _self_calibrate(
     ) -> Float[Array, " matches"]:
         change, M, b = state
         q = camera(change)
-        points_1, points_2 = (jax.vmap(jax.vmap(lambda xy: ideal(q, xy)))(xy) for xy in (xy1, xy2))
+        points_1, points_2 = jax.vmap(jax.vmap(jax.vmap(lambda xy: ideal(q, xy))))(
+            jnp.stack([xy1, xy2])
+        )
         e = jax.vmap(jax.vmap(sampson_distance, (None, None, 0, 0)))(M, b, points_1, points_2)
         return (root * q[fx] * e).ravel()
 

@@ -65,6 +65,9 @@ def iterate(
     - `go`: if false, nothing is done; `stopping`: when the damping is dropped.
     """
 
+    # Traced once, for the shapes of its results and in the loop.
+    linearise = jax.jit(linearise)
+
     def body(loop: Loop) -> Loop:
         # The start is tried in the first pass: the program contains the linearisation once.
         is_first, (trial_equations, trial_cost) = loop.steps == 0, linearise(loop.trial)
