@@ -395,9 +395,16 @@ def _minimise(
     σ it loses 6 of the near ones to rounding.
     """
 
+    def twice(p: Unknowns) -> tuple[Pixels, Pixels]:
+        values = computed(p)
+        return values, values
+
+    # Traced once, for the start and the steps.
+    @jax.jit
     def normal_equations(p: Unknowns) -> tuple[Normal, Unknowns, Scalar]:
         # Forward, and stored: in reverse, or within the products, grey values are looked up again.
-        J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
+        J, values = jax.lax.optimization_barrier(jax.jacfwd(twice, has_aux=True)(p))
+        v = values - grey
         return J.T @ J, J.T @ v, v @ v
 
     def improve(state: tuple[Any, ...]) -> tuple[Any, ...]:
