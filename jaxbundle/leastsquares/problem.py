@@ -500,12 +500,6 @@ def _shapes_by_name(data: Data) -> dict[str, tuple[int, ...]]:
     return {jax.tree_util.keystr(path): jnp.shape(x) for path, x in leaves}
 
 
-HISTORY_ROWS = (128, 2048, 10_000)
-"""Rows of the history of a search, which are compiled in: for the 100 steps of an adjustment, the
-2000 of a reconstruction with an unknown camera, and the most that are recorded, since three arrays
-of them are kept on every device."""
-
-
 def make_solver(
     problem: Problem,
     *,
@@ -521,8 +515,11 @@ def make_solver(
     squares = sum(_measured_squares(w, data.measured[o]) for o, w in data.weight.items())
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
+    # The rows of the history are compiled in: a size for the 100 steps of an adjustment, one for the
+    # 2000 of a reconstruction with an unknown camera, and the most that are recorded, since three
+    # arrays of them are kept on every device.
     limit = max(max_steps, largest_max_steps)
-    rows = next((rows for rows in HISTORY_ROWS if limit < rows), HISTORY_ROWS[-1])
+    rows = next((rows for rows in (128, 2048) if limit < rows), 10_000)
     return LeastSquares(
         problem.declared,
         problem.plan,

@@ -343,10 +343,9 @@ def _screen(
     """The factor of σ of every ray, and which are excluded when data snooping begins, from
     residuals without these: gross errors distort all others as long as they take part."""
     problem, values = result.problem, result.values
-    limit = limit_iterations(result.network) + 1
-    minimise_again = partial(
-        minimise_holding_infinite_points, max_steps=limit, largest_max_steps=limit
-    )
+    most = limit_iterations(result.network) + 1
+    options: dict[str, Any] = {"max_steps": most, "largest_max_steps": most}
+    minimise_again = partial(minimise_holding_infinite_points, **options)
     (v, r), point = _approximate_redundancy(result), problem.point
     # r ≥ 1/4 for two rays; one ray, r < 0, is judged like those that are hardly checked
     root = np.sqrt(np.maximum(r, 0.1))
