@@ -515,9 +515,9 @@ def make_solver(
     squares = sum(_measured_squares(w, data.measured[o]) for o, w in data.weight.items())
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
-    # The rows of the history are compiled in: a size for the 100 steps of an adjustment, one for the
-    # 2000 of a reconstruction with an unknown camera, and the most that are recorded, since three
-    # arrays of them are kept on every device.
+    # The rows of the history are compiled in: a size for the 100 steps of an adjustment, one for
+    # the 2000 of a reconstruction with an unknown camera, and the most that are recorded, since
+    # three arrays of them are kept on every device.
     limit = max(max_steps, largest_max_steps)
     rows = next((rows for rows in (128, 2048) if limit < rows), 10_000)
     return LeastSquares(
