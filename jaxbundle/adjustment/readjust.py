@@ -11,7 +11,11 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.minimum import inspect_solution, require_solved
 from jaxbundle.adjustment.problem import NetworkProblem
-from jaxbundle.adjustment.quality.blunder_names import image_points_removed, name_removed
+from jaxbundle.adjustment.quality.blunder_names import (
+    chosen_points_removed,
+    image_points_removed,
+    name_removed,
+)
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.quality.misfit import contradicts, doubt_of_baarda
 from jaxbundle.adjustment.quality.variance_groups import groups
@@ -102,11 +106,7 @@ def values_without(
     problem = result.problem
     weight = problem.image_weights / sigma_factor[:, None]
     reweighted = with_data(problem, problem.with_image_weights(problem.data, weight))
-    left_out = [
-        RemovedRow(name, int(row), None, np.inf)
-        for name, places in problem.image_rows.items()
-        for row in np.flatnonzero(is_left_out[places])
-    ]
+    left_out = chosen_points_removed(problem, is_left_out)
     repeat = _Repeat(minimise_again, "without gross errors", result.minimum)
     step = lambda problem, values: readjust(problem, values, repeat)
     return solve_without(reweighted, left_out, set(), values, step).values

@@ -108,6 +108,7 @@ def relative_orientation(
     return RelativeOrientation(M, b, fit.vtpv, fit.cofactor, front, flat & ~no_base, status)
 
 
+# This function and `retract` are traced once for all programs that contain them several times.
 @jax.jit
 def sampson_distance(
     M: Float[AnyArray, "3 3"],

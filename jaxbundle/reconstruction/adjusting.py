@@ -54,8 +54,9 @@ class WeightingSettings:
     more to restore; larger: more rounds until all gross errors are found."""
     max_screenings: int = 10
     """Maximum number of times that factors and suspects are determined before data snooping. In 60
-    frames of a video the first factors are up to 2.7 times too large, those of the tenth time right
-    to 6 %; data snooping then has two rounds instead of four, and 23 adjustments instead of 67."""
+    frames of a video (`benchmarks/reconstruct.py --set video`) the first factors are up to 3.7
+    times too large, those of the tenth time within 7 %; data snooping then has two rounds instead
+    of four, and 23 adjustments instead of 67."""
     last_change: float = 0.004
     """Relative change of a factor that ends the rounds: less than its own σ, 1/√(2·Σr), unless a
     class has more than 30 000 measurements."""

@@ -3,6 +3,9 @@
 import math
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+from jaxtyping import Bool
+
 from jaxbundle.adjustment.problem import NetworkProblem
 from jaxbundle.leastsquares.quality import robust, snooping
 from jaxbundle.network.blunders import Removed, Suspect, either_of
@@ -28,12 +31,18 @@ def image_points_removed(
         return []
     images, points = problem.network.images.id, problem.network.points.id
     places = zip(problem.image.tolist(), problem.point.tolist())
-    rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in pairs_of_ids}
+    is_removed = np.array([(images[i], points[p]) in pairs_of_ids for i, p in places], bool)
+    return chosen_points_removed(problem, is_removed)
+
+
+def chosen_points_removed(
+    problem: NetworkProblem, is_removed: Bool[np.ndarray, " rays"]
+) -> list[snooping.RemovedRow]:
+    """Chosen image points as removals for data snooping."""
     return [
         snooping.RemovedRow(name, row, None, math.inf)
         for name, places in problem.image_rows.items()
-        for row, place in enumerate(places.tolist())
-        if place in rows
+        for row in np.flatnonzero(is_removed[places]).tolist()
     ]
 
 
