@@ -46,7 +46,10 @@ def assert_same(found, name):
     assert found["termination"] == expected["termination"]
     assert len(expected["cost"]) > 2
     same = min(len(found["cost"]), len(expected["cost"])) - 1  # the last is a step of rounding
-    np.testing.assert_allclose(found["cost"][:same], expected["cost"][:same], rtol=1e-9)
+    # Conjugate gradients of an early step end at a loose tolerance, after one more or less of
+    # theirs as rounding has it.
+    rtol = 1e-7 if "iterative" in name else 1e-9
+    np.testing.assert_allclose(found["cost"][:same], expected["cost"][:same], rtol=rtol)
     for a, b in zip(found["values"], expected["values"], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8)
 

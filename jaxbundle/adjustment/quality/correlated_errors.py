@@ -429,10 +429,11 @@ def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> Er
     for k in np.unique(count[count > 1]):
         tracks = order[start[count == k][:, None] + np.arange(k)]
         image = rays.image[tracks]
-        # A root of each block by its eigenvalues: two images of one station are one.
+        # Two images of one station are one, and the block of both singular: its root is that of a
+        # block with as much more on the diagonal as rounding may be less than zero.
         distances = np.linalg.norm(station[image][:, :, None] - station[image][:, None], axis=3)
-        w, E = np.linalg.eigh(wendland(distances / (reach * depth)))
-        root = E * np.sqrt(np.clip(w, 0, None))[:, None, :]
+        nugget = 10 * k * np.finfo(float).eps * np.eye(k)
+        root = np.linalg.cholesky(wendland(distances / (reach * depth)) + nugget)
         column = first_column + np.arange(tracks.size).reshape(tracks.shape)
         rows.append(np.broadcast_to(rays.row[tracks][:, :, None], root.shape).ravel())
         columns.append(np.broadcast_to(column[:, None, :], root.shape).ravel())

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.leastsquares.quality.error_linearisation import LinearisedRows
+from jaxbundle.system.cores import available_cores
+from jaxbundle.system.threads import map_in_threads
 
 Batch = Float[np.ndarray, "m k c"]
 Places = Int[np.ndarray, "m c"]
@@ -110,7 +112,7 @@ def lay_out_clusters(
     order = order[np.lexsort((segment[order], cluster[order]))]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
     roots = [linear.A, F] if many is None else [linear.A, F, many]
-    padded, clusters = [_padded(matrix) for matrix in roots], []
+    padded = map_in_threads(_padded, roots, available_cores())
     # Sorted by a random number of their columns, clusters of equal ones are neighbours: points of
     # the same photographs, whose sums are one product.
     rng = np.random.default_rng(0)
@@ -121,7 +123,8 @@ def lay_out_clusters(
         key += number[columns].sum(1)
     # Batches of equal numbers of rows: padding to the longest track would square its length.
     kinds = np.stack([count, is_alone[order[start]]], 1)
-    for kind in np.unique(kinds, axis=0):
+
+    def lay_out(kind: Int[np.ndarray, "2"]) -> Clusters:
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
         # First by segments: clusters with the same ones are products of the same columns.
         rows = rows[np.lexsort((key[rows].sum(1), of_segment[segment[rows]].sum(1)))]
@@ -133,9 +136,9 @@ def lay_out_clusters(
             V = _products(columns[rows], x[rows], absent)
         fields = rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, narrow, narrow_at
         of_rows = segment[rows]
-        groups = _begin_groups([of_rows, A_at, narrow_at])
-        clusters.append(Clusters(*fields, V, of_rows, groups))
-    return clusters
+        return Clusters(*fields, V, of_rows, _begin_groups([of_rows, A_at, narrow_at]))
+
+    return map_in_threads(lay_out, np.unique(kinds, axis=0), available_cores())
 
 
 def _begin_groups(places: Sequence[Places]) -> Int[np.ndarray, " groups"]:
@@ -155,9 +158,8 @@ def _padded(
     absent, count = matrix.shape[1], np.diff(matrix.indptr)
     shape = len(count), int(count.max(initial=0))
     columns, values = np.full(shape, absent, np.int32), np.zeros(shape)
-    row = np.repeat(np.arange(len(count)), count)
-    place = np.arange(len(row)) - matrix.indptr[row]
-    columns[row, place], values[row, place] = matrix.indices, matrix.data
+    is_filled = np.arange(shape[1]) < count[:, None]
+    columns[is_filled], values[is_filled] = matrix.indices, matrix.data
     return columns, values, absent
 
 

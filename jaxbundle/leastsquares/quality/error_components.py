@@ -142,8 +142,8 @@ class ErrorSettings:
     - `max_columns`: roots of more columns are those of many (`error_products`), whose products with
       each other, of 8 MB for these, are not formed.
     - `max_clusters`: object points, or other eliminated rows, from which the skewness and the
-      uncertainty of sizes of such a component are, right to √(2/200) = 10 %; from ten times as
-      many are its traces with a field on the sensor, right to 1 %.
+      uncertainty of sizes of such a component are, right to √(2/100) = 14 %; from ten times as
+      many are its traces with the others, right to 1 %.
     - `significance`: a component is left out if its size could be chance (one-sided, at this level
       for all components together). θ ≥ 0 makes chance add to σ, never take from them: 18 % to those
       of the stations of twelve photographs with independent errors if all θ > 0 are taken, 10 % at
@@ -154,7 +154,7 @@ class ErrorSettings:
     """
 
     max_columns: int = 1000
-    max_clusters: int = 200
+    max_clusters: int = 100
     significance: float = 0.05
     draws: int = 100
     seed: int = 0

@@ -93,8 +93,8 @@ def _derivatives(declared: Declared, plan: Plan, values: Values, data: Data) -> 
 
 class DatumDirections(NamedTuple):
     """Open motions G and conditions B (`datum.conditions`) of kept unknowns and of eliminated rows,
-    with which a change x becomes x − G·a, a = (BᵀG)⁻¹Bᵀx: `inverse`, (BᵀG)⁻¹; `conditions`, the
-    part of B that acts on kept unknowns, B − Aᵀ·E·V⁻¹·B_e; `of_eliminated`, L⁻¹·B_e."""
+    with which a change x becomes x − G·a, a = (BᵀG)⁻¹Bᵀx: `conditions` of kept unknowns;
+    `of_eliminated`, L⁻¹·B_e; `inverse`, (BᵀG)⁻¹."""
 
     motions: Float[np.ndarray, "unknowns d"]
     motions_eliminated: Float[np.ndarray, "n width d"]
@@ -132,15 +132,11 @@ def datum_of(solution: Solution, linear: LinearisedRows) -> DatumDirections:
     stack_kept = lambda x: np.concatenate(
         [np.zeros((0, d)), *(x[g].reshape(-1, d) for g in plan.kept)]
     )
-    conditions, e = stack_kept(B), plan.eliminated
     of_eliminated = motions = np.zeros((rows, width, d))
-    if e is not None:
-        motions = G[e]
-        of_eliminated = np.asarray(solution.factor.lower_inverse) @ B[e]
-        # Q is zero where no row is eliminated.
-        h = np.einsum("rw,rwd->rd", linear.Q, of_eliminated[linear.eliminated])
-        conditions = conditions - linear.A.T @ h
-    return DatumDirections(stack_kept(G), motions, conditions, of_eliminated, np.linalg.inv(gram))
+    if (e := plan.eliminated) is not None:
+        motions, of_eliminated = G[e], np.asarray(solution.factor.lower_inverse) @ B[e]
+    kept = stack_kept(G), motions, stack_kept(B)
+    return DatumDirections(*kept, of_eliminated, np.linalg.inv(gram))
 
 
 @compile_once

@@ -19,195 +19,36 @@ powers of M·V follow from det(1 − z·M·V) = det(1 − z·P·V)·det(1 + Σ z
     tr((MV)³)  = l_3 − 3·tr a_3 + 3·tr(a_1·a_2) − tr a_1³
     tr((MV)⁴)  = l_4 − 4·tr a_4 + 4·tr(a_1·a_3) + 2·tr a_2² − 4·tr(a_1²·a_2) + tr a_1⁴
 
-l_n, a_1, a_2 and, of roots with few values in a row, tr(F̃ᵀVF̃) are exact. That of the others, and
-what only the skewness and the uncertainty of sizes need, a_3, a_4 and F̃ᵀV(MV)ⁿF̃ in full, is from
-some of the clusters where there are many.
+l_n, a_1 and a_2 are exact, and tr(F̃ᵀVF̃) of roots with few values in a row. That of the others is
+from some of the clusters where there are many; what only the skewness and the uncertainty of sizes
+need, a_3, a_4 and F̃ᵀV(MV)ⁿF̃ in full, is from fewer of them.
 """
 
-import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxbundle.leastsquares.equations.reduced import DenseFactor
 from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, lay_out_clusters
 from jaxbundle.leastsquares.quality.error_linearisation import (
-    DatumDirections,
     LinearisedRows,
     datum_of,
     linearise_rows,
 )
-from jaxbundle.leastsquares.quality.reduced_traces import Powers, ReducedTraces
-from jaxbundle.leastsquares.quality.root_columns import (
-    ColumnSegments,
-    Matrix,
-    RootColumns,
-    gram,
-    sort_roots,
+from jaxbundle.leastsquares.quality.error_sums import (
+    chosen_portions,
+    sum_products,
+    sums_of_wide,
+    tall,
 )
+from jaxbundle.leastsquares.quality.reduced_traces import Powers, ReducedTraces
+from jaxbundle.leastsquares.quality.root_columns import Matrix, RootColumns, sort_roots
 from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.system.cores import available_cores
+from jaxbundle.system.threads import map_in_threads
 from jaxbundle.types import not_none
-
-
-@dataclasses.dataclass
-class ClusterSums:
-    """Sums over clusters: AᵀPF, FᵀPF and with V between, AᵀPVPA and so on, of kept unknowns A and
-    roots F; of the directions h = E·V⁻¹·B_e of the datum, hᵀF and AᵀPVh; `FVF`: the diagonal, of
-    narrow roots; `powers`: tr((P·V)ⁿ)."""
-
-    AF: Matrix
-    FF: Matrix
-    hF: Matrix
-    AVA: Matrix
-    AVF: Matrix
-    AVPVA: Matrix
-    AVh: Matrix
-    hVh: Matrix
-    FVF: Float[np.ndarray, " q"]
-    powers: Float[np.ndarray, "4"]
-
-
-def sum_products(
-    clusters: Sequence[Clusters], roots: RootColumns, unknowns: int, datum: DatumDirections
-) -> ClusterSums:
-    """The sums over all clusters."""
-    # The place behind the last of each stands for none: clusters have as many places as the largest
-    # of their batch needs, and what those left over add is cut away at the end.
-    p, n, w = unknowns + 1, roots.narrow.shape[1] + 1, roots.wide.shape[1]
-    d, of_wide = datum.number, roots.segments
-    s, width = of_wide.number, of_wide.within.shape[1]
-    with_narrow, with_wide = np.zeros((p + n, p + n)), np.zeros((s, p + n, width))
-    AV, AV_wide, AVPVA = np.zeros((p, p + n)), np.zeros((s, p, width)), np.zeros((p, p))
-    AVh, hVh, hF, hW = np.zeros((p, d)), np.zeros((d, d)), np.zeros((d, n)), np.zeros((s, d, width))
-    FVF, powers, wide = np.zeros(n), np.zeros(4), gram(roots.wide)
-    for of_equal_size in clusters:
-        number = of_equal_size.A.shape[2] + of_equal_size.F.shape[2] + w
-        for c, segments in of_equal_size.by_segments(number):
-            a = c.A.shape[2]
-            columns = np.concatenate([c.A_at, p + c.F_at], 1)
-            W = of_wide.rows(c.rows)
-            _subtract_fit(wide, c, W, segments, of_wide)
-            X = c.without_fit(np.concatenate([c.A, c.F], 2))
-            A, F = X[:, :, :a], X[:, :, a:]
-            h = datum.effects(c.Q, c.eliminated)
-            # Rows of AᵀPW, FᵀPW and hᵀW, and of AᵀPVPW, in one product.
-            left_parts = [X, h]
-            if c.V is not None:
-                VA, Vh = c.V @ A, c.V @ h
-                PVA = c.without_fit(VA)
-                left_parts.append(PVA)
-                FVF += np.bincount(c.F_at.ravel(), np.sum(c.V @ F * F, 1).ravel(), n)
-                powers += _powers(c)
-                hVh += _tall(h).T @ _tall(Vh)
-            joint = np.concatenate(left_parts, 2)
-            # Clusters of the same photographs add to the same places: one product for all of them.
-            for some in c.by_columns():
-                rows, x, y = columns[some.start], _tall(X[some]), _tall(joint[some])
-                rows_of_A = rows[:a]
-                with_narrow[rows[:, None], rows] += x.T @ x
-                for segment, of_segment in segments:
-                    product = _tall(joint[some, of_segment]).T @ _tall(W[some, of_segment])
-                    with_wide[segment, rows] += product[: len(rows)]
-                    hW[segment] += product[len(rows) : len(rows) + d]
-                    if c.V is not None:
-                        AV_wide[segment, rows_of_A] += product[len(rows) + d :]
-                hF[:, rows[a:] - p] += _tall(h[some]).T @ _tall(c.F[some])
-                if c.V is not None:
-                    v, b = _tall(VA[some]), y[:, len(rows) + d :]
-                    AV[rows_of_A[:, None], rows] += v.T @ x
-                    AVPVA[rows_of_A[:, None], rows_of_A] += b.T @ b
-                    AVh[rows_of_A] += x[:, :a].T @ _tall(Vh[some])
-    kept, narrow = slice(0, p - 1), slice(p, p + n - 1)
-    mixed = roots.mix(of_wide.joined(with_wide))
-    wide = roots.mix(roots.mix(wide).T)
-    return ClusterSums(
-        np.concatenate([with_narrow[kept, narrow], mixed[kept]], 1),
-        np.block([[with_narrow[narrow, narrow], mixed[narrow]], [mixed[narrow].T, wide]]),
-        np.concatenate([hF[:, : n - 1], roots.mix(of_wide.joined(hW))], 1),
-        AV[kept, kept],
-        np.concatenate([AV[kept, narrow], roots.mix(of_wide.joined(AV_wide)[kept])], 1),
-        AVPVA[kept, kept],
-        AVh[kept],
-        hVh,
-        FVF[: n - 1],
-        powers,
-    )
-
-
-def _subtract_fit(
-    wide: Matrix,
-    c: Clusters,
-    W: Batch,
-    segments: Sequence[tuple[int, slice]],
-    of_wide: ColumnSegments,
-) -> None:
-    """WᵀPW = WᵀW − (QᵀW)ᵀ·QᵀW: three rows of QᵀW for a point instead of all of its rays."""
-    parts = []
-    for segment, rows in segments:
-        columns = slice(of_wide.begin[segment], of_wide.begin[segment + 1])
-        part = W[:, rows, : columns.stop - columns.start]
-        parts.append((columns, _tall(c.Q[:, rows].transpose(0, 2, 1) @ part)))
-    for k, (columns, x) in enumerate(parts):
-        wide[columns, columns] -= x.T @ x
-        for others, y in parts[:k]:
-            product = x.T @ y
-            wide[columns, others] -= product
-            wide[others, columns] -= product.T
-
-
-def share_of_many(
-    clusters: Sequence[Clusters],
-    roots: RootColumns,
-    FF: Matrix,
-    is_chosen: Bool[np.ndarray, " clusters"],
-) -> Float[np.ndarray, " mixed"]:
-    """The diagonal of FᵀPVPF of mixed wide roots, whose FᵀPF is given, from chosen clusters.
-
-    V is nearly a multiple of 1, as of errors along tracks: only the difference is from some of
-    them."""
-    w = len(FF)
-    part, of_white, trace, number = np.zeros(w), np.zeros(w), 0.0, 0
-    for c in _chosen_portions(clusters, is_chosen, w):
-        W = c.without_fit(roots.mix(roots.wide_rows(c.rows)))
-        V = not_none(c.V)
-        part += np.sum(V @ W * W, (0, 1))
-        of_white += np.sum(W * W, (0, 1))
-        trace += np.trace(V, axis1=1, axis2=2).sum()
-        number += V.shape[0] * V.shape[1]
-    # V = f·1 + (V − f·1), f its mean: the first part gives f·diag(FᵀPF), which is known exactly;
-    # the second is small, and its error with it.
-    factor = trace / max(number, 1)
-    share = len(is_chosen) / max(is_chosen.sum(), 1)
-    return factor * np.diag(FF) + share * (part - factor * of_white)
-
-
-def _chosen_portions(
-    clusters: Sequence[Clusters], is_chosen: Bool[np.ndarray, " clusters"], columns: int
-) -> Iterator[Clusters]:
-    """Chosen clusters, some at a time."""
-    begin = 0
-    for of_equal_size in clusters:
-        positions = np.flatnonzero(is_chosen[begin : begin + len(of_equal_size.rows)])
-        begin += len(of_equal_size.rows)
-        if len(positions):
-            yield from of_equal_size.some(positions).portions(columns)
-
-
-def _tall(x: Batch) -> Matrix:
-    """The rows of all clusters in one matrix."""
-    m, k, columns = x.shape
-    return x.reshape(m * k, columns)
-
-
-def _powers(c: Clusters) -> Float[np.ndarray, "4"]:
-    """Sums of tr((P·V)ⁿ)."""
-    PV = c.without_fit(not_none(c.V))
-    square = PV @ PV
-    product = lambda x, y: np.sum(x * y.transpose(0, 2, 1))
-    traces = product(PV, square), product(square, square)
-    return np.array([np.trace(PV, axis1=1, axis2=2).sum(), product(PV, PV), *traces])
 
 
 class ErrorProducts:
@@ -224,7 +65,9 @@ class ErrorProducts:
     ):
         self.solution, self.linear, self.clusters, self.roots = solution, linear, clusters, roots
         self.datum = datum_of(solution, linear)
-        self.sums = sum_products(clusters, roots, linear.A.shape[1], self.datum)
+        self.sums = sum_products(clusters, linear, roots, self.datum)
+        # Of the conditions, what acts on kept unknowns, themselves and through eliminated rows.
+        self.conditions = self.datum.conditions - self.sums.hA.T
         factor = solution.factor
         # The factor of the reduced system that the solution has anyway; Y = L⁻¹·D·AᵀPF, so that
         # (AᵀPF)ᵀ·S⁻¹·AᵀPF = YᵀY.
@@ -250,7 +93,7 @@ class ErrorProducts:
         """The changes of kept unknowns by the columns of the roots, N⁻¹AᵀF without the datum, and
         the motions a into it."""
         x, datum = self._back_substitute(self.Y), self.datum
-        return x, datum.inverse @ (datum.conditions.T @ x + self.sums.hF)
+        return x, datum.inverse @ (self.conditions.T @ x + self.sums.hF)
 
     def blocks_of_few(self, columns: slice, eliminated: bool) -> dict[str, np.ndarray]:
         """By group the covariance blocks X·Xᵀ that a component of few columns gives, of eliminated
@@ -297,7 +140,7 @@ class ErrorProducts:
         # Errors e change the kept unknowns by x and the datum by a, both linear in two sums over
         # clusters, z = (x, a) = T·(Aᵀ·P·e, hᵀ·e), whose covariance is that of the sums.
         inverse = self._back_substitute(self._forth(np.eye(p)))
-        onto = datum.inverse @ datum.conditions.T @ inverse
+        onto = datum.inverse @ self.conditions.T @ inverse
         T = np.block([[inverse, np.zeros((p, d))], [onto, datum.inverse]])
         C = T @ np.block([[self.sums.AVA, self.sums.AVh], [self.sums.AVh.T, self.sums.hVh]]) @ T.T
         of_kept = np.concatenate([np.eye(p), -datum.motions], 1)
@@ -317,26 +160,34 @@ class ErrorProducts:
         # The last of A's places stands for none.
         T, C = (np.insert(np.insert(x, p, 0.0, 0), p, 0.0, 1) for x in (T, C))
         of_datum = np.arange(p + 1, len(T))
-        for of_equal_size in self.clusters:
-            if of_equal_size.eliminated[0] < 0:
-                continue
-            for c in of_equal_size.portions(of_equal_size.A.shape[2]):
-                L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
-                alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
-                beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
-                Va = not_none(c.V) @ alpha.transpose(0, 2, 1)
-                h = datum.effects(c.Q, c.eliminated)
-                onto = np.concatenate([c.without_fit(c.A), h], 2).transpose(0, 2, 1) @ Va
-                blocks = alpha @ Va
-                for some in c.by_columns():
-                    columns = np.concatenate([c.A_at[some.start], of_datum])
-                    square = columns[:, None], columns
-                    b = beta[some]
-                    cross = b @ (T[square] @ onto[some])
-                    # cov(α·e − β·z) = α·V·αᵀ + β·C·βᵀ − β·cov(z, e)·αᵀ − its transpose
-                    blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
-                    blocks[some] -= cross + cross.transpose(0, 2, 1)
-                all_blocks[c.eliminated] = blocks
+
+        def add(c: Clusters) -> None:
+            L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
+            alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
+            beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
+            Va = not_none(c.V) @ alpha.transpose(0, 2, 1)
+            blocks = alpha @ Va
+            # cov(z, e)·αᵀ: AᵀP·V·αᵀ, and hᵀV·αᵀ
+            h = datum.effects(c.Q, c.eliminated)
+            of_A, of_h = (x.transpose(0, 2, 1) for x in (c.A, h))
+            onto = np.concatenate([of_A @ c.without_fit(Va), of_h @ Va], 1)
+            for some in c.by_columns():
+                columns = np.concatenate([c.A_at[some.start], of_datum])
+                square = columns[:, None], columns
+                b = beta[some]
+                cross = b @ (T[square] @ onto[some])
+                # cov(α·e − β·z) = α·V·αᵀ + β·C·βᵀ − β·cov(z, e)·αᵀ − its transpose
+                blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
+                blocks[some] -= cross + cross.transpose(0, 2, 1)
+            all_blocks[c.eliminated] = blocks
+
+        portions = [
+            portion
+            for c in self.clusters
+            if c.eliminated[0] >= 0
+            for portion in c.portions(c.A.shape[2])
+        ]
+        map_in_threads(add, portions, available_cores())
         return all_blocks
 
     def powers(self, at_most: int, rng: np.random.Generator) -> "Powers":
@@ -344,17 +195,19 @@ class ErrorProducts:
         what is not exact from `at_most` clusters."""
         s, q = self.sums, self.roots.number
         U = lambda x: self._forth(self._forth(x).T)
-        # U = P·A·D·L⁻ᵀ, with UᵀU = 1: products with U are those with A, solved forth on both sides.
-        a1, a2, b1 = U(s.AVA), U(s.AVPVA), self._forth(s.AVF) - U(s.AVA) @ self.Y
         # tr(F̃ᵀVF̃) by column, which T needs: from ten times as many clusters as what only the
         # skewness and the uncertainty of sizes need.
         number = sum(len(c.rows) for c in self.clusters)
-        order, n = rng.permutation(number), self.roots.narrow.shape[1]
-        is_chosen, of_diagonal = np.zeros(number, bool), np.zeros(number, bool)
-        is_chosen[order[:at_most]] = of_diagonal[order[: 10 * at_most]] = True
-        diagonal = share_of_many(self.clusters, self.roots, s.FF[n:, n:], of_diagonal)
-        diagonal = np.concatenate([s.FVF, diagonal]) - 2 * np.sum(self.Y * self._forth(s.AVF), 0)
-        diagonal = diagonal + np.sum(self.Y * (a1 @ self.Y), 0)
+        order = rng.permutation(number)
+        is_chosen, is_of_T = np.zeros(number, bool), np.zeros(number, bool)
+        is_chosen[order[:at_most]] = is_of_T[order[: 10 * at_most]] = True
+        of_wide = sums_of_wide(self.clusters, self.roots, s, is_of_T)
+        AVF, FVF = (np.concatenate(x, -1) for x in zip((s.AVF, s.FVF), of_wide))
+        AVF = self._forth(AVF)
+        # U = P·A·D·L⁻ᵀ, with UᵀU = 1: products with U are those with A, solved forth on both sides.
+        a1, a2 = U(s.AVA), U(s.AVPVA)
+        b1 = AVF - a1 @ self.Y
+        diagonal = FVF - np.sum(self.Y * (AVF + b1), 0)
         # The identities of the module; none of these matrices is larger than kept unknowns.
         l = s.powers
         trace = np.trace
@@ -367,7 +220,7 @@ class ErrorProducts:
         # Errors along a track are nearly independent ones, V ≈ f·1 with F̃ᵀVF̃ ≈ f·S: only the
         # difference is from some clusters.
         factor = t1 / max(self.solution.problem.counts.redundancy, 1)
-        for c in _chosen_portions(self.clusters, is_chosen, p + q):
+        for c in chosen_portions(self.clusters, is_chosen, p + q):
             x0 = np.concatenate(self._dense(c), 2)
             V = not_none(c.V)
             # x0 = (U, F̃); V·x0, P·V·x0, V·P·V·x0, P·V·P·V·x0: products of two of them are all
@@ -375,8 +228,8 @@ class ErrorProducts:
             x1 = V @ x0
             x2 = c.without_fit(x1)
             x3 = V @ x2
-            x4 = _tall(c.without_fit(x3))
-            x0, x1, x2, x3 = map(_tall, (x0, x1, x2, x3))
+            x4 = tall(c.without_fit(x3))
+            x0, x1, x2, x3 = map(tall, (x0, x1, x2, x3))
             near += x0[:, p:].T @ (x1 - factor * x0)[:, p:]
             u2, f2 = x2[:, :p], x2[:, p:]
             b2 += u2.T @ f2
@@ -401,11 +254,11 @@ class ErrorProducts:
     def _dense(self, c: Clusters) -> tuple[Batch, Batch]:
         """U and F̃ of some clusters."""
         p, n = self.linear.A.shape[1], self.roots.narrow.shape[1]
-        A = _tall(c.without_fit(c.spread(c.A, c.A_at, p)))
+        A = tall(c.without_fit(c.spread(c.A, c.A_at, p)))
         U = self._forth(A.T).T
         W = self.roots.mix(self.roots.wide_rows(c.rows))
         F = np.concatenate([c.spread(c.F, c.F_at, n), W], 2)
-        F = _tall(c.without_fit(F)) - U @ self.Y
+        F = tall(c.without_fit(F)) - U @ self.Y
         return U.reshape(*c.rows.shape, p), F.reshape(*c.rows.shape, F.shape[1])
 
     def traces(self, max_clusters: int, rng: np.random.Generator) -> ReducedTraces:

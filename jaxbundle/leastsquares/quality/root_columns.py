@@ -6,7 +6,7 @@ have, are further unknowns of the reduced system; the one of many columns has a 
 cluster (`error_products`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,8 +149,11 @@ def segments_of(F: Any) -> ColumnSegments:
     return ColumnSegments(begin, of_row, within)
 
 
-def gram(F: Any) -> Matrix:
-    """FᵀF of a sparse matrix, by dense products of the rows with values in the same columns."""
+def rows_of_equal_columns(
+    F: Any,
+) -> Iterator[tuple[Int[np.ndarray, " n"], Int[np.ndarray, " c"], Matrix]]:
+    """The rows of a sparse matrix with values in the same columns: these rows, the columns, and the
+    values."""
     count = np.diff(F.indptr)
     rows = np.flatnonzero(count)
     # Rows with values in the same columns have equal sums of the columns' random numbers; that
@@ -159,14 +162,16 @@ def gram(F: Any) -> Matrix:
     key = np.random.default_rng(0).integers(1, 1 << 40, F.shape[1])[F.indices]
     pattern = np.add.reduceat(key, F.indptr[rows]) if len(rows) else rows
     order = np.argsort(pattern, kind="stable")
-    begins = np.flatnonzero(np.diff(pattern[order], prepend=-1))
-    # Fewer than four rows of a pattern: the call costs more than a sparse product saves.
-    if 4 * len(begins) > len(rows):
-        return (F.T @ F).toarray()
-    product, rows = np.zeros((F.shape[1],) * 2), rows[order]
+    begins, rows = np.flatnonzero(np.diff(pattern[order], prepend=-1)), rows[order]
     for a, b in zip(begins, [*begins[1:], len(rows)]):
         start, number = F.indptr[rows[a:b]], count[rows[a]]
         columns = F.indices[start[0] : start[0] + number]
-        x = F.data[start[:, None] + np.arange(number)]
+        yield rows[a:b], columns, F.data[start[:, None] + np.arange(number)]
+
+
+def gram(F: Any) -> Matrix:
+    """FᵀF of a sparse matrix, by dense products of the rows with values in the same columns."""
+    product = np.zeros((F.shape[1],) * 2)
+    for _, columns, x in rows_of_equal_columns(F):
         product[columns[:, None], columns] += x.T @ x
     return product
