@@ -237,10 +237,17 @@ def _parts(
     zero = (views, POSE, POSE), (views, POSE, k), (k, k), ()
     no_covariances = lambda: Covariances(*map(jnp.zeros, zero))
     if_wanted = lambda c, function: jax.lax.cond(is_wanted[c], function, no_covariances)
+    # Of those by view all three, or none.
+    any_by_view = jnp.any(is_wanted[FIELD + 1 : TRACKS])
+    by_view = jax.lax.cond(
+        any_by_view,
+        lambda: covariances_by_view(spans, displacements_by_view(on_sensor, is_used)),
+        lambda: [no_covariances() for _ in BY_VIEW],
+    )
     component_covariances = [
         no_covariances(),
         if_wanted(FIELD, of_field),
-        *covariances_by_view(spans, displacements_by_view(on_sensor, is_used)),
+        *by_view,
         if_wanted(TRACKS, along_tracks),
         *(
             if_wanted(GIVEN + n, partial(of_given, axes_of_component))

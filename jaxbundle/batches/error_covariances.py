@@ -23,6 +23,7 @@ from jaxbundle.batches.error_spans import (
     in_single_precision,
     products_of_rows,
 )
+from jaxbundle.batches.normal import POSE
 
 
 class Covariances(NamedTuple):
@@ -50,13 +51,16 @@ class OntoSpans(NamedTuple):
 
 def onto_field(
     spans: Spans,
-    splines: Float[Array, "views points splines"],
+    splines: Float[Array, "views splines points"],
     octaves: Float[Array, "splines splines"],
 ) -> tuple[Float[Array, "views 6 n"], Float[Array, "k n"]]:
     """W·F and Z·F of the field."""
-    project = lambda A: jnp.einsum("veap,vps->veas", in_single_precision(A), splines) @ octaves
-    flat = lambda A: A.reshape(*A.shape[:-2], -1)
-    return flat(project(spans.W)), flat(project(spans.Z).sum(0))
+    # One product of all rows of a view.
+    rows = in_single_precision(jnp.concatenate([spans.W, spans.Z], 1))
+    projected = jnp.einsum("veap,vsp->veas", rows, splines)
+    onto_octaves = lambda A: (A @ in_single_precision(octaves)).reshape(*A.shape[:-2], -1)
+    of_views, of_camera = projected[:, :POSE], projected[:, POSE:].sum(0)
+    return onto_octaves(of_views).astype(float), onto_octaves(of_camera).astype(float)
 
 
 def onto_spans(spans: Spans, roots: Roots) -> OntoSpans:

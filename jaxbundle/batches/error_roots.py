@@ -11,8 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.adjustment.quality.correlated_errors import (
     CorrelationSettings,
-    cubic_splines,
+    cubic_spline,
     root_of_octaves,
+    squares_of_splines,
 )
 from jaxbundle.adjustment.quality.given_points import correlation_of_points, wendland
 from jaxbundle.batches.normal import CameraUnknowns, Sightings
@@ -42,16 +43,21 @@ def mean_square_of_octaves(
     is_used: Float[Array, "views points"],
     settings: CorrelationSettings,
 ) -> Float[Array, ""]:
-    """That of the sum of all octaves of splines, Σ_i Σ_j (x_i·y_j)² = Σ_i x_i²·Σ_j y_j². Of one
-    side four splines are not zero, whose squares follow from the place between two knots."""
+    """That of the sum of all octaves of splines, Σ_i Σ_j (x_i·y_j)² = Σ_i x_i²·Σ_j y_j²."""
     total = jnp.zeros(())
     for octave in settings.octaves_of_knots:
-        intervals = place * (np.asarray(octave) - 3)
-        # Sums of four arrays: a sum over an axis of four is not vectorised.
-        four = cubic_splines(intervals - jnp.floor(intervals), 4) ** 2
-        square = four[..., 0] + four[..., 1] + four[..., 2] + four[..., 3]
-        total += jnp.sum(is_used * square[..., 0] * square[..., 1])
+        x, y = (squares_of_splines(place[..., k], octave[k]) for k in (0, 1))
+        total += jnp.sum(is_used * x * y)
     return total / jnp.sum(is_used)
+
+
+def splines(
+    place: Float[Array, "views points"], number: int
+) -> Float[Array, "views number points"]:
+    """`correlated_errors.cubic_splines` with image points, of which there are many, along the last
+    axis: operations along it are vectorised."""
+    middle = jnp.arange(number, dtype=place.dtype)[:, None] - 1
+    return jnp.asarray(cubic_spline((place * (number - 3))[:, None] - middle))
 
 
 def fields_of_camera(
@@ -59,20 +65,23 @@ def fields_of_camera(
     is_used: Float[Array, "views points"],
     settings: CorrelationSettings,
 ) -> tuple[
-    Float[Array, "views points splines"],
+    Float[Array, "views splines points"],
     Float[Array, "splines splines"],
     Float[Array, "splines splines"],
 ]:
-    """The finest splines B on the sensor and the root R of all octaves in them, of a mean square of
-    one, with (BR)ᵀBR."""
-    x, y = (cubic_splines(place[..., k], settings.knots[k]) for k in (0, 1))
+    """The finest splines B on the sensor, in single precision, and the root R of all octaves in
+    them, of a mean square of one, with (BR)ᵀBR."""
+    of_sides = lambda place: tuple(
+        splines(place[..., k], number) for k, number in enumerate(settings.knots)
+    )
     # Not computed again for every product.
-    x, y = jax.lax.optimization_barrier((x, y * is_used[..., None]))
-    B = y[..., :, None].astype(jnp.float32) * x[..., None, :].astype(jnp.float32)
-    B = B.reshape(*is_used.shape, -1)
+    x, y = jax.lax.optimization_barrier(of_sides(place.astype(jnp.float32)))
+    B = (y * is_used[:, None].astype(jnp.float32))[:, :, None] * x[:, None]
+    B = B.reshape(len(B), -1, B.shape[-1])
     square = mean_square_of_octaves(place, is_used, settings)
     octaves = jnp.asarray(root_of_octaves(settings)) / jnp.sqrt(square)
-    gram = _gram_of_products(x.reshape(-1, x.shape[-1]), y.reshape(-1, y.shape[-1]))
+    x, y = of_sides(place)
+    gram = _gram_of_products(_of_all_views(x), _of_all_views(y * is_used[:, None]))
     return B, octaves, octaves.T @ gram @ octaves
 
 
@@ -83,11 +92,15 @@ def field_form(
     settings: CorrelationSettings,
 ) -> Float[Array, ""]:
     """‖(BR)ᵀv‖² of the splines and octaves of `fields_of_camera`, as products of x and of y."""
-    x, y = (cubic_splines(place[..., k], n).reshape(-1, n) for k, n in enumerate(settings.knots))
-    residual = v.swapaxes(0, 1).reshape(2, -1)
-    products = [(y * residual_axis[:, None]).T @ x for residual_axis in residual]
+    x, y = (_of_all_views(splines(place[..., k], n)) for k, n in enumerate(settings.knots))
+    residual = _of_all_views(v)
+    products = [(y * residual_axis) @ x.T for residual_axis in residual]
     of_octaves = jnp.stack(products).reshape(2, -1) @ root_of_octaves(settings)
     return jnp.sum(of_octaves**2) / mean_square_of_octaves(place, is_used, settings)
+
+
+def _of_all_views(x: Float[Array, "views rows points"]) -> Float[Array, "rows rays"]:
+    return x.swapaxes(0, 1).reshape(x.shape[1], -1)
 
 
 def displacements_by_view(
@@ -103,12 +116,12 @@ def displacements_by_view(
 
 
 def _gram_of_products(
-    x: Float[Array, "rays columns"], y: Float[Array, "rays rows"]
+    x: Float[Array, "columns rays"], y: Float[Array, "rows rays"]
 ) -> Float[Array, "splines splines"]:
     """BᵀB of the products B of splines of x and of y, of which only neighbours overlap."""
-    (pairs_x, number_x), (pairs_y, number_y) = (_neighbours(a.shape[1]) for a in (x, y))
-    product = lambda a, pairs: a[:, pairs[0]] * a[:, pairs[1]]
-    products_of_pairs = product(x, pairs_x).T @ product(y, pairs_y)
+    (pairs_x, number_x), (pairs_y, number_y) = (_neighbours(len(a)) for a in (x, y))
+    product = lambda a, pairs: a[pairs[0]] * a[pairs[1]]
+    products_of_pairs = product(x, pairs_x) @ product(y, pairs_y).T
     products_of_pairs = jnp.pad(products_of_pairs, [(0, 1), (0, 1)])  # those that do not overlap
     full = products_of_pairs[number_x[None, :, None, :], number_y[:, None, :, None]]
     return full.reshape(number_x.shape[0] * number_y.shape[0], -1)

@@ -78,7 +78,7 @@ class Roots(eqx.Module):
     of the points; the effects of the points."""
 
     used: Float[Array, "views points"]
-    splines: Float[Array, "views points splines"]
+    splines: Float[Array, "views splines points"]
     octaves: Float[Array, "splines splines"]
     gram: Float[Array, "splines splines"]
     by_view: Float[Array, "views 2 points 5"]
@@ -90,7 +90,7 @@ class Roots(eqx.Module):
         """F_kᵀ·u of residuals u."""
         point = jnp.einsum("vapd,rvap->rdp", self.by_point, u)
         return Products(
-            jnp.einsum("vps,rvap->ras", self.splines, u) @ self.octaves,
+            jnp.einsum("vsp,rvap->ras", self.splines, u) @ self.octaves,
             jnp.einsum("vapc,rvap->rvc", self.by_view, u),
             jnp.einsum("vw,rvap->rwap", self.views, u),
             point @ self.points,
@@ -128,7 +128,7 @@ class Roots(eqx.Module):
         normal = lambda k, *shape: jax.random.normal(keys[k], (number, *shape), theta.dtype)
         e = size[0] * normal(0, views, 2, points) * self.used[:, None]
         field = normal(1, 2, len(self.octaves)) @ self.octaves.T
-        e += size[FIELD] * jnp.einsum("vps,ras->rvap", self.splines, field)
+        e += size[FIELD] * jnp.einsum("vsp,ras->rvap", self.splines, field)
         of_view = jnp.repeat(size[2:TRACKS], jnp.array([2, 1, 2]), total_repeat_length=5)
         e += jnp.einsum("vapc,rvc->rvap", self.by_view, of_view * normal(2, views, 5))
         e += size[TRACKS] * self.along_tracks(normal(3, views, 2, points))

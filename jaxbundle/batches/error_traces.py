@@ -72,7 +72,7 @@ class FewColumns(NamedTuple):
         field = jax.scipy.linalg.block_diag(roots.gram, roots.gram)
         field = field - jnp.einsum("ves,vet->st", WB, WB) - ZB.T @ ZB
         mixed = (
-            jnp.einsum("vps,vapc->vacs", roots.splines, in_single_precision(roots.by_view))
+            jnp.einsum("vsp,vapc->vacs", roots.splines, in_single_precision(roots.by_view))
             @ roots.octaves
         )
         mixed = mixed.swapaxes(1, 2).reshape(views, columns, -1)
