@@ -13,7 +13,7 @@ from scipy import integrate
 import jaxbundle
 from jaxbundle import Camera, InputError, NotSolvedError
 from jaxbundle.adjustment import far_points
-from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.adjust import adjust, snoop_again
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.cameras import get_model, residual
 from jaxbundle.choices import ESTIMATORS
@@ -138,6 +138,28 @@ def test_what_nothing_is_left_to_test_has_no_test(network):
     assert "not tested again" in " ".join(found.report().split())
     told = [entry["test"] for entry in found.to_dict()["removed"]]
     assert told.count(None) == len(of_point)
+
+
+def test_snooping_from_an_earlier_result_ends_at_the_same(network):
+    """With other σ, from an adjustment with all blunders: as a whole adjustment."""
+    spoilt, bad, _ = with_blunders(network, 2, 0.01)
+    earlier, rays = adjust(spoilt), spoilt.observations
+    suspects = [
+        (spoilt.images.id[i], spoilt.points.id[p])
+        for i, p in zip(rays.image[bad][::2], rays.point[bad][::2])
+    ]
+    larger = lambda n: n.replace(
+        observations=dataclasses.replace(n.observations, sigma=1.3 * n.observations.sigma)
+    )
+    expected = adjust(larger(spoilt), snooping="pope", doubtful=suspects)
+    weighted = larger(earlier.problem.network)
+    found = snoop_again(earlier, weighted, earlier.values, suspects, 0.001, 100)
+    assert found.converged and found.redundancy == expected.redundancy
+    assert {r.name for r in found.removed} == {r.name for r in expected.removed}
+    assert len(found.removed) > len(suspects)
+    assert found.sigma0 == pytest.approx(expected.sigma0, rel=1e-9)
+    np.testing.assert_allclose(found.image_values, expected.image_values, atol=1e-7)
+    np.testing.assert_allclose(found.image_covariance, expected.image_covariance, rtol=1e-5)
 
 
 def test_predicted_test_of_an_observation(network):

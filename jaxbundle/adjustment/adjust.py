@@ -9,9 +9,8 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.adjustment.far_points import (
-    minimise_holding_infinite_points,
-)
+from jaxbundle.adjustment.exclusions import transfer_start_values
+from jaxbundle.adjustment.far_points import minimise_holding_infinite_points
 from jaxbundle.adjustment.first_minimum import FirstMinimum, require_most_oriented
 from jaxbundle.adjustment.likely_causes import (
     largest_sigma0,
@@ -26,7 +25,7 @@ from jaxbundle.adjustment.minimum import (
 )
 from jaxbundle.adjustment.mirrored_control import name_mirrored, name_other_side
 from jaxbundle.adjustment.orient import orient
-from jaxbundle.adjustment.problem import NetworkProblem
+from jaxbundle.adjustment.problem import NetworkProblem, make_problem
 from jaxbundle.adjustment.quality.blunder_names import name_suspect
 from jaxbundle.adjustment.quality.correlated_errors import DEFAULTS as CORRELATIONS
 from jaxbundle.adjustment.quality.inspection import Inspection
@@ -49,11 +48,13 @@ from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.formats import as_network
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.iterations.search import SEARCHES
 from jaxbundle.leastsquares.iterations.solver import Minimum
 from jaxbundle.leastsquares.iterations.stopping import converged
 from jaxbundle.leastsquares.problem import with_factor
 from jaxbundle.leastsquares.quality.snooping import check_test
+from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, Observations, Points
 from jaxbundle.network.unit_mistakes import (
     name_unit_of_positions,
@@ -207,6 +208,46 @@ def adjust(  # noqa: PLR0913 - the options of an adjustment
     if not correlated:
         return result
     return result.with_changes(correlations=CORRELATIONS).with_correlated_errors()
+
+
+def snoop_again(
+    earlier: Adjustment,
+    network: Network,
+    values: Values,
+    doubtful: Iterable[tuple[str, str]],
+    significance: float,
+    max_iterations: int,
+) -> Adjustment:
+    """The result of data snooping by Pope's test in a network that was adjusted before, from values
+    near to its end: without the search for start values, a first minimum with all gross errors, and
+    what rays do not determine.
+
+    **Arguments:** `earlier`: the result; `network`: that of its problem, with other σ or datum
+    points; `values` of the unknowns of its problem; `doubtful`: as of `adjust`, one or more.
+
+    **Raises:** `NotSolvedError` if it is not determined without gross errors."""
+    max_steps = max_iterations + 1
+    options: dict[str, Any] = {
+        "search": SEARCHES[earlier.method],
+        "max_steps": max_steps,
+        "largest_max_steps": max_steps,
+    }
+    minimise_again = partial(minimise_holding_infinite_points, **options)
+    lengths, reduction = earlier.problem.lengths, earlier.reduction
+    problem = make_problem(network, reduction=reduction, lengths=lengths)
+    start = transfer_start_values(problem, earlier.problem, values)
+    problem, minimum, removed, doubt = snoop_network(
+        Inspection(problem, start),
+        earlier.minimum,
+        minimise_again,
+        "pope",
+        significance,
+        doubtful,
+    )
+    state = _AdjustmentState(network, problem, minimum, earlier.method, reduction)
+    state.result_fields |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
+    state.search_second_minima(partial(find_second_minima, minimise=minimise_again))
+    return state.adjustment(earlier.check or split_check_points(network)[1:])
 
 
 def _orient(network: Network, mirror: Callable[[float | None], str]) -> Oriented:

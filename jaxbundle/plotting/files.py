@@ -203,7 +203,8 @@ def png(
         # Names in a script missing from the font: boxes in the figure, no action required.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         draw(ax=figure.add_subplot(projection=projection))  # some measure their text
-        canvas.print_png(data)
+        # The least compression: half the time to write, a ninth more bytes.
+        canvas.print_png(data, pil_kwargs={"compress_level": 1})
     return data.getvalue()
 
 

@@ -22,12 +22,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.adjustment.adjust import adjust
+from jaxbundle.adjustment.adjust import adjust, snoop_again
 from jaxbundle.adjustment.far_points import minimise_holding_infinite_points
 from jaxbundle.adjustment.quality.inspection import Inspection
 from jaxbundle.adjustment.readjust import values_without
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
 from jaxbundle.network.subsets import keep_points
 from jaxbundle.network.tables import Network, are_among
@@ -299,22 +300,21 @@ def _weight(
     tell("adjustment")
     result, network, is_kept = adjust_determined(network)
     measurement_class, sigma = measurement_class[is_kept], network.observations.sigma
-    factor_so_far, suspects = np.ones(len(is_kept)), []
+    factor_so_far, suspects, values = np.ones(len(is_kept)), [], None
     if result.converged:
         rows = _rows(result, network)
-        factor_so_far[rows], is_suspect = _screen(result, measurement_class[rows], settings)
+        screened = _screen(result, measurement_class[rows], settings)
+        factor_so_far[rows], is_suspect, values = screened
         suspects = _pairs_of_ids(result, is_suspect)
         # Once: a datum that changes with each round would change all σ, too.
         network = network.replace(datum_points=choose_datum_points(result))
     for rounds_left in reversed(range(settings.max_rounds)):
         tell("data snooping")
         weighted = dataclasses.replace(network.observations, sigma=sigma * factor_so_far[:, None])
-        result, network, is_kept = adjust_determined(
-            network.replace(observations=weighted),
-            snooping="pope",
-            significance=significance,
-            doubtful=suspects,
+        result, network, is_kept = _snoop(
+            network.replace(observations=weighted), result, values, suspects, significance
         )
+        values = None
         measurement_class, sigma, factor_so_far = (
             measurement_class[is_kept],
             sigma[is_kept],
@@ -338,11 +338,40 @@ def _weight(
     return WeightedAdjustment(result, factors, int(result.problem.used.sum()))
 
 
+def _snoop(
+    network: Network,
+    earlier: Adjustment,
+    values: Values | None,
+    suspects: list[tuple[str, str]],
+    significance: float,
+) -> tuple[Adjustment, Network, Int[np.ndarray, " rays"]]:
+    """Data snooping, as `adjust_determined`; where an earlier adjustment was solved and there are
+    suspects, from its end, or from other `values` near to it."""
+    if suspects and earlier.converged:
+        problem, rows = earlier.problem, _rows(earlier, network)
+        of_problem = dataclasses.replace(
+            problem.network.observations, sigma=network.observations.sigma[rows]
+        )
+        changed = problem.network.replace(
+            observations=of_problem, datum_points=network.datum_points
+        )
+        start, limit = values or earlier.values, limit_iterations(network)
+        try:
+            result = snoop_again(earlier, changed, start, suspects, significance, limit)
+        except NotSolvedError:
+            pass
+        else:
+            if result.converged:
+                return result, network, np.arange(len(network.observations))
+    return adjust_determined(network, snooping="pope", significance=significance, doubtful=suspects)
+
+
 def _screen(
     result: Adjustment, measurement_class: Int[np.ndarray, " rays"], settings: WeightingSettings
-) -> tuple[Float[np.ndarray, " rays"], Bool[np.ndarray, " rays"]]:
+) -> tuple[Float[np.ndarray, " rays"], Bool[np.ndarray, " rays"], Values]:
     """The factor of σ of every ray, and which are excluded when data snooping begins, from
-    residuals without these: gross errors distort all others as long as they take part."""
+    residuals without these: gross errors distort all others as long as they take part; the values
+    of the unknowns without them."""
     problem, values = result.problem, result.values
     most = limit_iterations(result.network) + 1
     options: dict[str, Any] = {"max_steps": most, "largest_max_steps": most}
@@ -369,7 +398,7 @@ def _screen(
         except NotSolvedError:
             break
         v = Inspection(problem, values).image_residuals
-    return factor, is_suspect
+    return factor, is_suspect, values
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:

@@ -128,7 +128,7 @@ def test_sigma_are_multiplied_until_they_fit(monkeypatch, last, changes, expecte
     monkeypatch.setattr(adjusting, "_redundancy", lambda _: (np.ones((len(every), 2)),) * 2)
     factors = lambda *_: np.full(len(every), next(changes))
     monkeypatch.setattr(adjusting, "_factors", factors)
-    monkeypatch.setattr(adjusting, "_screen", lambda *_: (factors(), every < 0))
+    monkeypatch.setattr(adjusting, "_screen", lambda *_: (factors(), every < 0, None))
     classes, settings = np.zeros(len(every), int), adjusting.WeightingSettings()
     done = adjusting._weight(network, classes, {0: "all"}, 0.001, lambda _: None, settings)
     assert done.factors["all"] == pytest.approx(expected)
