@@ -182,8 +182,8 @@ def test_gross_errors_do_not_distort_the_first_factors():
     result = adjust(network.replace(observations=given))
     classes, settings = np.zeros(len(rays), int), adjusting.WeightingSettings()
     once = dataclasses.replace(settings, max_screenings=1)
-    distorted, _ = adjusting._screen(result, classes, once)
-    factor, is_suspect = adjusting._screen(result, classes, settings)
+    distorted, *_ = adjusting._screen(result, classes, once)
+    factor, is_suspect, _ = adjusting._screen(result, classes, settings)
     assert distorted[0] > 1.5 * factor[0]
     # Of Σr = 1.3·10³ the σ of the factor is 2 %; normalised residuals above four are cut off.
     assert factor[0] == pytest.approx(1 / 3, rel=0.06)

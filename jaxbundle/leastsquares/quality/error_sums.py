@@ -139,7 +139,7 @@ class _Sums:
         turned, W = c.Q.transpose(0, 2, 1), self.of_wide.rows(c.rows)
         X, h = turned @ np.concatenate([c.A, c.F], 2), self.datum.of_eliminated[c.eliminated]
         by_segment = [turned[:, :, rows] @ W[:, rows] for _, rows in segments]
-        Y = np.concatenate([*by_segment, W[:, :0, :0]] if not segments else by_segment, 2)
+        Y = np.concatenate([X[:, :, :0], *by_segment], 2)
         at, width = np.concatenate([c.A_at, self.of_narrow + c.F_at], 1), W.shape[2]
         # Clusters of the same photographs add to the same places: one product for all of them.
         for some in c.by_columns():
