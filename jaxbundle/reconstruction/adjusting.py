@@ -11,7 +11,7 @@
    Measurements with residuals above `suspect_residual`·f are gross errors, most likely: 2. again
    without them, until they are the same ones.
 3. Data snooping, and 2. again for the remaining measurements, with their redundancy numbers, until
-   the factors converge.
+   the factors converge; every time from where the last adjustment ended.
 """
 
 import dataclasses
