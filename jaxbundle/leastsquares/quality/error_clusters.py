@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.leastsquares.quality.error_linearisation import LinearisedRows
-from jaxbundle.system.cores import available_cores
-from jaxbundle.system.threads import map_in_threads
 
 Batch = Float[np.ndarray, "m k c"]
 Places = Int[np.ndarray, "m c"]
@@ -112,7 +110,7 @@ def lay_out_clusters(
     order = order[np.lexsort((segment[order], cluster[order]))]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
     roots = [linear.A, F] if many is None else [linear.A, F, many]
-    padded = map_in_threads(_padded, roots, available_cores())
+    padded = [_padded(matrix) for matrix in roots]
     # Sorted by a random number of their columns, clusters of equal ones are neighbours: points of
     # the same photographs, whose sums are one product.
     rng = np.random.default_rng(0)
@@ -138,7 +136,7 @@ def lay_out_clusters(
         of_rows = segment[rows]
         return Clusters(*fields, V, of_rows, _begin_groups([of_rows, A_at, narrow_at]))
 
-    return map_in_threads(lay_out, np.unique(kinds, axis=0), available_cores())
+    return [lay_out(kind) for kind in np.unique(kinds, axis=0)]
 
 
 def _begin_groups(places: Sequence[Places]) -> Int[np.ndarray, " groups"]:

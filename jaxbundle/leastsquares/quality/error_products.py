@@ -46,8 +46,6 @@ from jaxbundle.leastsquares.quality.error_sums import (
 from jaxbundle.leastsquares.quality.reduced_traces import Powers, ReducedTraces
 from jaxbundle.leastsquares.quality.root_columns import Matrix, RootColumns, sort_roots
 from jaxbundle.leastsquares.solution import Solution
-from jaxbundle.system.cores import available_cores
-from jaxbundle.system.threads import map_in_threads
 from jaxbundle.types import not_none
 
 
@@ -181,13 +179,10 @@ class ErrorProducts:
                 blocks[some] -= cross + cross.transpose(0, 2, 1)
             all_blocks[c.eliminated] = blocks
 
-        portions = [
-            portion
-            for c in self.clusters
-            if c.eliminated[0] >= 0
-            for portion in c.portions(c.A.shape[2])
-        ]
-        map_in_threads(add, portions, available_cores())
+        for of_equal_size in self.clusters:
+            if of_equal_size.eliminated[0] >= 0:
+                for portion in of_equal_size.portions(of_equal_size.A.shape[2]):
+                    add(portion)
         return all_blocks
 
     def powers(self, at_most: int, rng: np.random.Generator) -> "Powers":

@@ -11,7 +11,7 @@ some of the clusters,
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,8 +24,6 @@ from jaxbundle.leastsquares.quality.root_columns import (
     gram,
     rows_of_equal_columns,
 )
-from jaxbundle.system.cores import available_cores
-from jaxbundle.system.threads import map_in_threads
 from jaxbundle.types import not_none
 
 
@@ -57,20 +55,11 @@ def sum_products(
     datum: DatumDirections,
 ) -> ClusterSums:
     """The sums over all clusters."""
-    portions = [
-        portion
-        for c in clusters
-        for portion in c.by_segments(c.A.shape[2] + c.F.shape[2] + roots.wide.shape[1])
-    ]
-    empty = lambda: _Sums(roots, linear.A.shape[1], datum)
-    # The sums of all threads are no larger than what they are of.
-    at_once = min(available_cores(), max(int(linear.A.nnz / max(empty().size, 1)), 1))
-    tasks = [lambda: _without_clusters(linear, roots), lambda: gram(roots.wide)]
-    tasks += [lambda k=k: empty().add(portions[k::at_once]) for k in range(at_once)]
-    (with_narrow, with_wide), wide, *parts = map_in_threads(lambda task: task(), tasks, at_once)
-    total = parts[0]
-    for part in parts[1:]:
-        total.join(part)
+    (with_narrow, with_wide), wide = _without_clusters(linear, roots), gram(roots.wide)
+    total = _Sums(roots, linear.A.shape[1], datum)
+    for c in clusters:
+        columns = c.A.shape[2] + c.F.shape[2] + roots.wide.shape[1]
+        total.add(c.by_segments(columns))
     with_narrow -= total.with_narrow
     with_wide -= total.with_wide
     wide -= total.wide
@@ -91,7 +80,7 @@ def sum_products(
         total.AVX[kept, narrow],
         total.FVF[:n],
         total.powers,
-        float(total.diagonal / max(total.rows, 1)),
+        total.diagonal / max(total.rows, 1),
     )
 
 
@@ -110,29 +99,15 @@ class _Sums:
         self.AVX, self.AVPVA = np.zeros((p, places)), np.zeros((p, p))
         self.FVF = np.zeros(places - p)
         self.AVh, self.hVh = np.zeros((p, d)), np.zeros((d, d))
-        self.powers, self.diagonal, self.rows = np.zeros(4), np.zeros(()), np.zeros((), int)
+        self.powers, self.diagonal, self.rows = np.zeros(4), 0.0, 0
 
-    @property
-    def arrays(self) -> list[np.ndarray]:
-        return [x for x in vars(self).values() if isinstance(x, np.ndarray)]
-
-    @property
-    def size(self) -> int:
-        return sum(x.size for x in self.arrays)
-
-    def join(self, other: "_Sums") -> None:
-        """Add the sums over other clusters."""
-        for mine, theirs in zip(self.arrays, other.arrays):
-            mine += theirs
-
-    def add(self, portions: Sequence[tuple[Clusters, list[tuple[int, slice]]]]) -> "_Sums":
+    def add(self, portions: Iterable[tuple[Clusters, list[tuple[int, slice]]]]) -> None:
         """Add clusters whose rows have the same segments, given with them."""
         for c, segments in portions:
             if c.V is not None:
                 self._add_with_V(c, c.V)
             if c.eliminated[0] >= 0:
                 self._add_fit(c, segments)
-        return self
 
     def _add_fit(self, c: Clusters, segments: Sequence[tuple[int, slice]]) -> None:
         """Add (QᵀX)ᵀ·QᵀX of all roots and unknowns, and hᵀX."""
