@@ -245,7 +245,12 @@ def snoop_again(
         doubtful,
     )
     state = _AdjustmentState(network, problem, minimum, earlier.method, reduction)
-    state.result_fields |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
+    # A minimum left for this one was left by the earlier adjustment.
+    state.result_fields |= {
+        "removed": tuple(removed),
+        "doubts": (doubt,) if doubt else (),
+        "second_minima": earlier.second_minima,
+    }
     state.search_second_minima(partial(find_second_minima, minimise=minimise_again))
     return state.adjustment(earlier.check or split_check_points(network)[1:])
 

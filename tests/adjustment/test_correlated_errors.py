@@ -10,6 +10,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.quality import correlated_errors
 from jaxbundle.adjustment.quality.correlated_errors import (
     CorrelationSettings,
     cubic_splines,
@@ -473,3 +474,30 @@ def test_finished_jobs_of_one_camera_are_compared(clean, shaken, tmp_path):
     np.testing.assert_allclose(first.correlated, sum(C), rtol=1e-6)
     assert "several jobs differ by" in found.sentence
     assert "Jobs of one camera: 3 pairs" in str(found)
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-9, 1e-3])
+def test_tracks_of_photographs_of_one_station_have_a_root(spread):
+    """Photographs turned on a tripod: correlations of 1, and a singular block for every track."""
+    rng, images, points = np.random.default_rng(0), 60, 3
+    image, point = np.divmod(np.arange(images * points), points)
+    row = 2 * np.arange(len(image))
+    nothing = np.zeros((len(image), 2))
+    rays = correlated_errors.ImageRows(
+        row, image, point, 0 * image, nothing, 1 + nothing, 2 * len(image)
+    )
+    station = spread * rng.normal(size=(images, 3))
+    scene = correlated_errors.StationsAndPoints(station, rng.normal(size=(points, 3)) + [0, 0, 9])
+    root = correlated_errors._along_tracks(rays, scene, 0.6).root
+    V = (root @ root.T).toarray()
+    first = row[point == 0]
+    np.testing.assert_allclose(V[np.ix_(first, first)], np.ones((images, images)), atol=1e-5)
+    assert not V[np.ix_(first, first + 1)].any() and not V[np.ix_(first, row[point == 1])].any()
+
+
+@pytest.mark.parametrize("number", [4, 5, 7, 11])
+def test_squares_of_splines_are_a_cubic_in_every_interval(number):
+    place = np.linspace(0, 1, 301)
+    expected = np.sum(cubic_splines(place, number) ** 2, 1)
+    found = correlated_errors.squares_of_splines(place, number)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)

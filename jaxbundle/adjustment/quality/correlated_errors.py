@@ -448,10 +448,11 @@ def _along_tracks(rays: ImageRows, scene: StationsAndPoints, reach: float) -> Er
     for k in np.unique(count[count > 1]):
         tracks = order[start[count == k][:, None] + np.arange(k)]
         image = rays.image[tracks]
-        # Two images of one station are one, and the block of both singular: its root is that of a
-        # block with as much more on the diagonal as rounding may be less than zero.
+        # Two images of one station are one, and the block of both singular. Rounding of Cholesky's
+        # method takes up to k(k + 1)·ε/2 from eigenvalues (Higham 2002, theorem 10.7), that of the
+        # correlations a few k·ε: so much more is on the diagonal.
         distances = np.linalg.norm(station[image][:, :, None] - station[image][:, None], axis=3)
-        nugget = 10 * k * np.finfo(float).eps * np.eye(k)
+        nugget = 4 * k * (k + 1) * np.finfo(float).eps * np.eye(k)
         root = np.linalg.cholesky(wendland(distances / (reach * depth)) + nugget)
         column = first_column + np.arange(tracks.size).reshape(tracks.shape)
         rows.append(np.broadcast_to(rays.row[tracks][:, :, None], root.shape).ravel())

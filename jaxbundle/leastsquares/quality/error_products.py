@@ -158,31 +158,28 @@ class ErrorProducts:
         # The last of A's places stands for none.
         T, C = (np.insert(np.insert(x, p, 0.0, 0), p, 0.0, 1) for x in (T, C))
         of_datum = np.arange(p + 1, len(T))
-
-        def add(c: Clusters) -> None:
-            L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
-            alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
-            beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
-            Va = not_none(c.V) @ alpha.transpose(0, 2, 1)
-            blocks = alpha @ Va
-            # cov(z, e)·αᵀ: AᵀP·V·αᵀ, and hᵀV·αᵀ
-            h = datum.effects(c.Q, c.eliminated)
-            of_A, of_h = (x.transpose(0, 2, 1) for x in (c.A, h))
-            onto = np.concatenate([of_A @ c.without_fit(Va), of_h @ Va], 1)
-            for some in c.by_columns():
-                columns = np.concatenate([c.A_at[some.start], of_datum])
-                square = columns[:, None], columns
-                b = beta[some]
-                cross = b @ (T[square] @ onto[some])
-                # cov(α·e − β·z) = α·V·αᵀ + β·C·βᵀ − β·cov(z, e)·αᵀ − its transpose
-                blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
-                blocks[some] -= cross + cross.transpose(0, 2, 1)
-            all_blocks[c.eliminated] = blocks
-
         for of_equal_size in self.clusters:
-            if of_equal_size.eliminated[0] >= 0:
-                for portion in of_equal_size.portions(of_equal_size.A.shape[2]):
-                    add(portion)
+            if of_equal_size.eliminated[0] < 0:
+                continue
+            for c in of_equal_size.portions(of_equal_size.A.shape[2]):
+                L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
+                alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
+                beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
+                Va = not_none(c.V) @ alpha.transpose(0, 2, 1)
+                blocks = alpha @ Va
+                # cov(z, e)·αᵀ: AᵀP·V·αᵀ, and hᵀV·αᵀ
+                h = datum.effects(c.Q, c.eliminated)
+                of_A, of_h = (x.transpose(0, 2, 1) for x in (c.A, h))
+                onto = np.concatenate([of_A @ c.without_fit(Va), of_h @ Va], 1)
+                for some in c.by_columns():
+                    columns = np.concatenate([c.A_at[some.start], of_datum])
+                    square = columns[:, None], columns
+                    b = beta[some]
+                    cross = b @ (T[square] @ onto[some])
+                    # cov(α·e − β·z) = α·V·αᵀ + β·C·βᵀ − β·cov(z, e)·αᵀ − its transpose
+                    blocks[some] += b @ C[square] @ b.transpose(0, 2, 1)
+                    blocks[some] -= cross + cross.transpose(0, 2, 1)
+                all_blocks[c.eliminated] = blocks
         return all_blocks
 
     def powers(self, at_most: int, rng: np.random.Generator) -> "Powers":

@@ -3,9 +3,9 @@ are made of (`error_products`).
 
 With P = 1 − Q·Qᵀ a product XᵀPY is XᵀY, of rows with values in the same columns at a time, less
 (QᵀX)ᵀ·QᵀY, which has three rows for a point instead of two for each of its rays. A product with V
-of a component of many columns between, XᵀPVPY, needs all of them: it is formed exactly where a
-covariance depends on it. Of the others V is replaced by its mean, f, and the difference is from
-some of the clusters,
+of a component of many columns between, XᵀPVPY, needs all of them: it is formed exactly for unknowns
+and roots of few values in a row. For the others V is replaced by its mean, f, and the difference is
+from some of the clusters,
 
     XᵀPVPY = f·XᵀPY + XᵀP(V − f)PY
 """
@@ -162,6 +162,7 @@ def _without_clusters(
     A, F, of_wide = linear.A, roots.narrow, roots.segments
     behind = sp.csr_matrix((A.shape[0], 1))
     X = sp.hstack([A, behind, F, behind]).tocsr()
+    X.sort_indices()
     with_narrow = np.zeros((X.shape[1],) * 2)
     with_wide = np.zeros((of_wide.number, X.shape[1], of_wide.within.shape[1]))
     for rows, columns, x in rows_of_equal_columns(X):
