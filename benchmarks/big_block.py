@@ -130,13 +130,13 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
     # of a new solution each time: it keeps what it has computed
     again = lambda: jaxbundle.Adjustment(simulation.network, problem, minimum)  # noqa: E731
     modelled = lambda: modelled_covariances(again())  # noqa: E731
-    first_modelled_s = modelled()
+    first_modelled_s = modelled_covariances(result)
+    memory["modelled covariances"] = machine.peak_mb()
     summary = {name: getattr(result, name) for name in ("redundancy", "converged", "termination")}
     summary["sigma0"], parameters = result.sigma0, result.cameras["cam"]["parameters"]
     del result, _  # otherwise two of them would exist at a time
     statistics_s = best(statistics, repeat)
     modelled_s = np.min([modelled() for _ in range(repeat)], 0)
-    memory["modelled covariances"] = machine.peak_mb()
 
     evaluations = int(minimum.iterations)
     return summary | {

@@ -7,8 +7,9 @@ of tall dense ones (2·10⁹ operations in 0.04 s; a product of sparse matrices 
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
-from typing import Any
+import functools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,49 +22,64 @@ Places = Int[np.ndarray, "m c"]
 
 @dataclasses.dataclass(frozen=True)
 class Clusters:
-    """m clusters of k rows each: `rows` of the observations, the eliminated row (−1: none of these
-    clusters has one), Q, the values of A and of narrow roots F in the columns `A_at` and `F_at`
-    (the number of columns stands for none), and V of a component of many columns. Rows of one
-    cluster are sorted by `segment`, the range of columns of wide roots that they have; clusters of
-    equal columns and segments begin at `groups`."""
+    """m clusters of k rows each: `rows` of the observations, of which those of one cluster are
+    sorted by `segment`, the range of columns of wide roots that they have. `roots`: of narrow
+    components, and of the one of many columns.
+
+    Values are laid out when they are asked for, which is for some at a time: those of all clusters
+    take more memory than all statistics."""
 
     rows: Int[np.ndarray, "m k"]
-    eliminated: Int[np.ndarray, " m"]
-    Q: Batch
-    A: Batch
-    A_at: Places
-    F: Batch
-    F_at: Places
-    V: Float[np.ndarray, "m k k"] | None
-    segment: Int[np.ndarray, "m k"]
-    groups: Int[np.ndarray, " groups"]
+    linear: LinearisedRows
+    roots: tuple[Any, Any | None]
+    segment: Int[np.ndarray, " rows"]
+
+    @property
+    def has_eliminated(self) -> bool:
+        """Whether these clusters have eliminated rows; all of them have, or none."""
+        return bool(self.linear.eliminated[self.rows[0, 0]] >= 0)
+
+    @property
+    def eliminated(self) -> Int[np.ndarray, " m"]:
+        """The eliminated row (−1: none of these clusters has one)."""
+        return self.linear.eliminated[self.rows[:, 0]]
+
+    @functools.cached_property
+    def Q(self) -> Batch:
+        return self.linear.Q[self.rows]
+
+    @functools.cached_property
+    def A(self) -> "ValuesAt":
+        """The derivatives by kept unknowns."""
+        return _local(*_padded(self.linear.A, self.rows))
+
+    @functools.cached_property
+    def F(self) -> "ValuesAt":
+        """The narrow roots."""
+        return _local(*_padded(self.roots[0], self.rows))
+
+    @functools.cached_property
+    def V(self) -> Float[np.ndarray, "m k k"] | None:
+        """V of the component of many columns."""
+        many = self.roots[1]
+        return None if many is None else _products(*_padded(many, self.rows))
 
     def without_fit(self, x: Batch) -> Batch:
         """P·x."""
         return x - self.Q @ (self.Q.transpose(0, 2, 1) @ x)
 
-    def spread(self, values: Batch, columns: Places, number: int) -> Batch:
-        """Values in all of a number of columns from those in the columns `columns`; others are left
-        out."""
-        dense = np.zeros((*self.rows.shape, number + 1))
-        cluster, row = (np.arange(n) for n in self.rows.shape)
-        columns = np.where((columns < 0) | (columns > number), number, columns)
-        dense[cluster[:, None, None], row[:, None], columns[:, None]] = values
-        return dense[:, :, :number]
-
     def some(self, at: Any) -> "Clusters":
         """Some of the clusters."""
-        fields = self.rows, self.eliminated, self.Q, self.A, self.A_at, self.F, self.F_at
-        rows, eliminated, Q, A, A_at, F, F_at = (x[at] for x in fields)
-        V, segment = None if self.V is None else self.V[at], self.segment[at]
-        groups = _begin_groups([segment, A_at, F_at])
-        return Clusters(rows, eliminated, Q, A, A_at, F, F_at, V, segment, groups)
+        return dataclasses.replace(self, rows=self.rows[at])
 
     def portions(self, columns: int, at_once: int = 1_000_000) -> Iterator["Clusters"]:
-        """Some clusters at a time, whose rows of so many columns have at most `at_once` numbers (8
-        MB: four times as many take the same time, but memory that has to be cleared first)."""
+        """Some clusters at a time, whose rows of their own and so many more columns have about
+        `at_once` numbers (8 MB: four times as many take the same time, but memory that has to be
+        cleared first)."""
         m, k = self.rows.shape
-        step = max(at_once // max(k * columns, 1), 1)
+        # Of clusters of as many rows, about as many columns as the first one has.
+        own_columns = [np.unique(x[self.rows[0]].indices) for x in (self.linear.A, self.roots[0])]
+        step = max(at_once // max(k * (sum(map(len, own_columns)) + columns), 1), 1)
         for begin in range(0, m, step):
             yield self.some(slice(begin, begin + step))
 
@@ -71,22 +87,44 @@ class Clusters:
         """Some clusters at a time (`portions`), whose rows have the same segments; these, with the
         rows that have them."""
         for portion in self.portions(columns):
-            begins = _begin_groups([portion.segment])
-            for begin, end in zip(begins, [*begins[1:], len(portion.rows)]):
-                of_row = portion.segment[begin]
-                starts = np.flatnonzero(np.diff(of_row, prepend=-2))
-                ranges = zip(starts, [*starts[1:], len(of_row)])
-                segments = [(int(of_row[a]), slice(a, b)) for a, b in ranges if of_row[a] >= 0]
-                whole = len(begins) == 1
-                yield portion if whole else portion.some(slice(begin, end)), segments
-
-    def by_columns(self) -> Iterator[slice]:
-        """Clusters of equal columns."""
-        for begin, end in zip(self.groups, [*self.groups[1:], len(self.rows)]):
-            yield slice(begin, end)
+            of_rows = self.segment[portion.rows]
+            for equal in equal_neighbours(of_rows):
+                segment = of_rows[equal.start]
+                starts = np.flatnonzero(np.diff(segment, prepend=-2))
+                ranges = zip(starts, [*starts[1:], len(segment)])
+                segments = [(int(segment[a]), slice(a, b)) for a, b in ranges if segment[a] >= 0]
+                yield portion.some(equal), segments
 
 
-def lay_out_clusters(
+class ValuesAt(NamedTuple):
+    """Values of rows of clusters in the columns `at` (the number of columns stands for none)."""
+
+    values: Batch
+    at: Places
+
+    def spread(self, number: int, first: int = 0) -> Batch:
+        """The values in a number of columns from `first` on; others are left out."""
+        m, k, _ = self.values.shape
+        dense = np.zeros((m, k, number + 1))
+        columns = self.at - first
+        columns = np.where((columns < 0) | (columns > number), number, columns)
+        cluster, row = np.arange(m)[:, None, None], np.arange(k)[:, None]
+        dense[cluster, row, columns[:, None]] = self.values
+        return dense[:, :, :number]
+
+
+def equal_neighbours(*places: Places) -> Iterator[slice]:
+    """Clusters of equal columns."""
+    new = np.zeros(len(places[0]), bool)
+    new[:1] = True
+    for columns in places:
+        new[1:] |= (columns[1:] != columns[:-1]).any(1)
+    begins = np.flatnonzero(new)
+    for begin, end in zip(begins, [*begins[1:], len(new)]):
+        yield slice(begin, end)
+
+
+def find_clusters(
     linear: LinearisedRows, F: Any, segment: Int[np.ndarray, " rows"], many: Any | None
 ) -> list[Clusters] | None:
     """The clusters of all rows with a derivative or an error, by their number of rows, from sparse
@@ -109,65 +147,52 @@ def lay_out_clusters(
     order = np.flatnonzero(some)
     order = order[np.lexsort((segment[order], cluster[order]))]
     _, start, count = np.unique(cluster[order], return_index=True, return_counts=True)
-    roots = [linear.A, F] if many is None else [linear.A, F, many]
-    padded = [_padded(matrix) for matrix in roots]
     # Sorted by a random number of their columns, clusters of equal ones are neighbours: points of
     # the same photographs, whose sums are one product.
     rng = np.random.default_rng(0)
-    of_columns = [rng.integers(1, 1 << 40, absent + 1) for *_, absent in padded[:2]]
-    of_segment = rng.integers(1, 1 << 40, segment.max(initial=-1) + 2)
+    random_number = lambda number: rng.integers(1, 1 << 40, number)
     key = np.zeros(len(cluster), int)
-    for number, (columns, *_) in zip(of_columns, padded):
-        key += number[columns].sum(1)
+    for matrix in (linear.A, F):
+        # of the entries that are stored, whatever their values
+        ones = np.ones(len(matrix.indices), int)
+        key += type(matrix)((ones, matrix.indices, matrix.indptr), matrix.shape) @ random_number(
+            matrix.shape[1]
+        )
+    of_segment = random_number(segment.max(initial=-1) + 2)
     # Batches of equal numbers of rows: padding to the longest track would square its length.
     kinds = np.stack([count, is_alone[order[start]]], 1)
 
-    def lay_out(kind: Int[np.ndarray, "2"]) -> Clusters:
+    def of_kind(kind: Int[np.ndarray, "2"]) -> Clusters:
         rows = order[start[(kinds == kind).all(1)][:, None] + np.arange(kind[0])]
         # First by segments: clusters with the same ones are products of the same columns.
         rows = rows[np.lexsort((key[rows].sum(1), of_segment[segment[rows]].sum(1)))]
-        (A, A_at), (narrow, narrow_at) = (
-            _local(columns[rows], x[rows], absent) for columns, x, absent in padded[:2]
-        )
-        V = None
-        for columns, x, absent in padded[2:]:
-            V = _products(columns[rows], x[rows], absent)
-        fields = rows, linear.eliminated[rows[:, 0]], linear.Q[rows], A, A_at, narrow, narrow_at
-        of_rows = segment[rows]
-        return Clusters(*fields, V, of_rows, _begin_groups([of_rows, A_at, narrow_at]))
+        return Clusters(rows, linear, (F, many), segment)
 
-    return [lay_out(kind) for kind in np.unique(kinds, axis=0)]
-
-
-def _begin_groups(places: Sequence[Places]) -> Int[np.ndarray, " groups"]:
-    """Where clusters of equal columns begin."""
-    new = np.zeros(len(places[0]), bool)
-    new[:1] = True
-    for columns in places:
-        new[1:] |= (columns[1:] != columns[:-1]).any(1)
-    return np.flatnonzero(new)
+    return [of_kind(kind) for kind in np.unique(kinds, axis=0)]
 
 
 def _padded(
-    matrix: Any,
-) -> tuple[Int[np.ndarray, "rows s"], Float[np.ndarray, "rows s"], int]:
-    """Columns and values of every row of a sparse matrix, up to the largest number of them, and the
+    matrix: Any, rows: Int[np.ndarray, "m k"]
+) -> tuple[Int[np.ndarray, "m k s"], Float[np.ndarray, "m k s"], int]:
+    """Columns and values of some rows of a sparse matrix, up to the largest number of them, and the
     column that stands for none."""
-    absent, count = matrix.shape[1], np.diff(matrix.indptr)
-    shape = len(count), int(count.max(initial=0))
-    columns, values = np.full(shape, absent, np.int32), np.zeros(shape)
-    is_filled = np.arange(shape[1]) < count[:, None]
-    columns[is_filled], values[is_filled] = matrix.indices, matrix.data
-    return columns, values, absent
+    begin, count = matrix.indptr[rows][..., None], np.diff(matrix.indptr)[rows][..., None]
+    place = np.arange(count.max(initial=0))
+    is_filled, at = place < count, np.minimum(begin + place, max(matrix.nnz - 1, 0))
+    absent = matrix.shape[1]
+    if not matrix.nnz:
+        return np.full(at.shape, absent, np.int32), np.zeros(at.shape), absent
+    columns = np.where(is_filled, matrix.indices[at], absent)
+    return columns, np.where(is_filled, matrix.data[at], 0.0), absent
 
 
 def _local(
     columns: Int[np.ndarray, "m k s"], values: Float[np.ndarray, "m k s"], absent: int
-) -> tuple[Batch, Places]:
+) -> ValuesAt:
     """The values of k rows in the distinct columns that any of them has, and these."""
     m, k, s = columns.shape
     if m * k * s == 0:
-        return np.zeros((m, k, 0)), np.zeros((m, 0), int)
+        return ValuesAt(np.zeros((m, k, 0)), np.zeros((m, 0), int))
     # Columns are sorted once for all neighbours that have the same in every row.
     new = np.ones(m, bool)
     new[1:] = (columns[1:] != columns[:-1]).any((1, 2))
@@ -184,7 +209,7 @@ def _local(
     dense = np.zeros((m, k, places.shape[1]))
     cluster, row = np.arange(m)[:, None, None], np.arange(k)[None, :, None]
     dense[cluster, row, slot_of.reshape(-1, k, s)[run]] = values
-    return dense, places[run]
+    return ValuesAt(dense, places[run])
 
 
 def _products(
@@ -195,5 +220,5 @@ def _products(
     relative = np.where(
         columns == absent, absent, columns - columns.min((1, 2), initial=absent)[:, None, None]
     )
-    G, _ = _local(relative, values, absent)
+    G = _local(relative, values, absent).values
     return G @ G.transpose(0, 2, 1)

@@ -31,7 +31,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.leastsquares.equations.reduced import DenseFactor
-from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, lay_out_clusters
+from jaxbundle.leastsquares.quality.error_clusters import (
+    Batch,
+    Clusters,
+    equal_neighbours,
+    find_clusters,
+)
 from jaxbundle.leastsquares.quality.error_linearisation import (
     LinearisedRows,
     datum_of,
@@ -114,18 +119,18 @@ class ErrorProducts:
         blocks = np.zeros((*datum.motions_eliminated.shape[:2], self.linear.Q.shape[1]))
         padded = np.concatenate([x, np.zeros((1, number))])
         for of_equal_size in self.clusters:
-            if of_equal_size.eliminated[0] < 0:
+            if not of_equal_size.has_eliminated:
                 continue
             for c in of_equal_size.portions(number):
                 if columns.start >= narrow:
                     wide = slice(columns.start - narrow, columns.stop - narrow)
                     F = self.roots.mix(self.roots.wide_rows(c.rows))[:, :, wide]
                 else:
-                    F = c.spread(c.F, c.F_at - columns.start, number)
+                    F = c.F.spread(number, columns.start)
                 turned = c.Q.transpose(0, 2, 1)
-                QF, QA = turned @ F, turned @ c.A
-                for some in c.by_columns():
-                    QF[some] -= QA[some] @ padded[c.A_at[some.start]]
+                QF, QA = turned @ F, turned @ c.A.values
+                for some in equal_neighbours(c.A.at):
+                    QF[some] -= QA[some] @ padded[c.A.at[some.start]]
                 L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
                 change = L.transpose(0, 2, 1) @ QF - datum.motions_eliminated[c.eliminated] @ a
                 blocks[c.eliminated] = change @ change.transpose(0, 2, 1)
@@ -159,20 +164,22 @@ class ErrorProducts:
         T, C = (np.insert(np.insert(x, p, 0.0, 0), p, 0.0, 1) for x in (T, C))
         of_datum = np.arange(p + 1, len(T))
         for of_equal_size in self.clusters:
-            if of_equal_size.eliminated[0] < 0:
+            if not of_equal_size.has_eliminated:
                 continue
-            for c in of_equal_size.portions(of_equal_size.A.shape[2]):
+            for c in of_equal_size.portions(0):
                 L = np.asarray(self.solution.factor.lower_inverse)[c.eliminated]
                 alpha = L.transpose(0, 2, 1) @ c.Q.transpose(0, 2, 1)
-                beta = np.concatenate([alpha @ c.A, datum.motions_eliminated[c.eliminated]], 2)
+                beta = np.concatenate(
+                    [alpha @ c.A.values, datum.motions_eliminated[c.eliminated]], 2
+                )
                 Va = not_none(c.V) @ alpha.transpose(0, 2, 1)
                 blocks = alpha @ Va
                 # cov(z, e)·αᵀ: AᵀP·V·αᵀ, and hᵀV·αᵀ
                 h = datum.effects(c.Q, c.eliminated)
-                of_A, of_h = (x.transpose(0, 2, 1) for x in (c.A, h))
+                of_A, of_h = (x.transpose(0, 2, 1) for x in (c.A.values, h))
                 onto = np.concatenate([of_A @ c.without_fit(Va), of_h @ Va], 1)
-                for some in c.by_columns():
-                    columns = np.concatenate([c.A_at[some.start], of_datum])
+                for some in equal_neighbours(c.A.at):
+                    columns = np.concatenate([c.A.at[some.start], of_datum])
                     square = columns[:, None], columns
                     b = beta[some]
                     cross = b @ (T[square] @ onto[some])
@@ -246,10 +253,10 @@ class ErrorProducts:
     def _dense(self, c: Clusters) -> tuple[Batch, Batch]:
         """U and F̃ of some clusters."""
         p, n = self.linear.A.shape[1], self.roots.narrow.shape[1]
-        A = tall(c.without_fit(c.spread(c.A, c.A_at, p)))
+        A = tall(c.without_fit(c.A.spread(p)))
         U = self._forth(A.T).T
         W = self.roots.mix(self.roots.wide_rows(c.rows))
-        F = np.concatenate([c.spread(c.F, c.F_at, n), W], 2)
+        F = np.concatenate([c.F.spread(n), W], 2)
         F = tall(c.without_fit(F)) - U @ self.Y
         return U.reshape(*c.rows.shape, p), F.reshape(*c.rows.shape, F.shape[1])
 
@@ -306,7 +313,7 @@ def error_products(
         return None
     linear = linearise_rows(solution)
     segment = sorted_roots.segments.of_row
-    clusters = lay_out_clusters(linear, sorted_roots.narrow, segment, sorted_roots.many)
+    clusters = find_clusters(linear, sorted_roots.narrow, segment, sorted_roots.many)
     if clusters is None:
         return None
     return ErrorProducts(solution, linear, clusters, sorted_roots, reduced)

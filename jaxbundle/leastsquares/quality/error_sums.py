@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters
+from jaxbundle.leastsquares.quality.error_clusters import Batch, Clusters, equal_neighbours
 from jaxbundle.leastsquares.quality.error_linearisation import DatumDirections, LinearisedRows
 from jaxbundle.leastsquares.quality.root_columns import (
     Matrix,
@@ -58,8 +58,7 @@ def sum_products(
     (with_narrow, with_wide), wide = _without_clusters(linear, roots), gram(roots.wide)
     total = _Sums(roots, linear.A.shape[1], datum)
     for c in clusters:
-        columns = c.A.shape[2] + c.F.shape[2] + roots.wide.shape[1]
-        total.add(c.by_segments(columns))
+        total.add(c.by_segments(roots.wide.shape[1]))
     with_narrow -= total.with_narrow
     with_wide -= total.with_wide
     wide -= total.wide
@@ -106,18 +105,21 @@ class _Sums:
         for c, segments in portions:
             if c.V is not None:
                 self._add_with_V(c, c.V)
-            if c.eliminated[0] >= 0:
+            if c.has_eliminated:
                 self._add_fit(c, segments)
 
     def _add_fit(self, c: Clusters, segments: Sequence[tuple[int, slice]]) -> None:
         """Add (QᵀX)ᵀ·QᵀX of all roots and unknowns, and hᵀX."""
         turned, W = c.Q.transpose(0, 2, 1), self.of_wide.rows(c.rows)
-        X, h = turned @ np.concatenate([c.A, c.F], 2), self.datum.of_eliminated[c.eliminated]
+        X, h = (
+            turned @ np.concatenate([c.A.values, c.F.values], 2),
+            self.datum.of_eliminated[c.eliminated],
+        )
         by_segment = [turned[:, :, rows] @ W[:, rows] for _, rows in segments]
         Y = np.concatenate([X[:, :, :0], *by_segment], 2)
-        at, width = np.concatenate([c.A_at, self.of_narrow + c.F_at], 1), W.shape[2]
+        at, width = np.concatenate([c.A.at, self.of_narrow + c.F.at], 1), W.shape[2]
         # Clusters of the same photographs add to the same places: one product for all of them.
-        for some in c.by_columns():
+        for some in equal_neighbours(at):
             places, x = at[some.start], tall(X[some])
             self.with_narrow[places[:, None], places] += x.T @ x
             self.hX[:, places] += tall(h[some]).T @ x
@@ -135,13 +137,14 @@ class _Sums:
 
     def _add_with_V(self, c: Clusters, V: Batch) -> None:
         """Add what has V between."""
-        A, F, h = c.without_fit(c.A), c.without_fit(c.F), self.datum.effects(c.Q, c.eliminated)
+        A, F = c.without_fit(c.A.values), c.without_fit(c.F.values)
+        h = self.datum.effects(c.Q, c.eliminated)
         VA, Vh = V @ A, V @ h
         PVA = c.without_fit(VA)
         self.hVh += tall(h).T @ tall(Vh)
-        self.FVF += np.bincount(c.F_at.ravel(), np.sum(V @ F * F, 1).ravel(), len(self.FVF))
-        for some in c.by_columns():
-            of_A, of_F = c.A_at[some.start], self.of_narrow + c.F_at[some.start]
+        self.FVF += np.bincount(c.F.at.ravel(), np.sum(V @ F * F, 1).ravel(), len(self.FVF))
+        for some in equal_neighbours(c.A.at, c.F.at):
+            of_A, of_F = c.A.at[some.start], self.of_narrow + c.F.at[some.start]
             x, y, v = tall(A[some]), tall(PVA[some]), tall(VA[some])
             self.AVX[of_A[:, None], of_A] += v.T @ x
             self.AVX[of_A[:, None], of_F] += v.T @ tall(F[some])
@@ -184,12 +187,12 @@ def sums_of_wide(
     p, n, f = len(sums.AA) + 1, roots.narrow.shape[1], sums.mean_of_V
     AVF, FVF = np.zeros((p, roots.wide.shape[1])), np.zeros(roots.number - n)
     for c in chosen_portions(clusters, is_chosen, roots.number):
-        A, F = c.without_fit(c.A), c.without_fit(roots.wide_rows(c.rows))
+        A, F = c.without_fit(c.A.values), c.without_fit(roots.wide_rows(c.rows))
         V, mixed = not_none(c.V) - f * np.eye(c.rows.shape[1]), roots.mix(F)
         FVF += np.sum(V @ mixed * mixed, (0, 1))
         VA = V @ A
-        for some in c.by_columns():
-            AVF[c.A_at[some.start]] += tall(VA[some]).T @ tall(F[some])
+        for some in equal_neighbours(c.A.at):
+            AVF[c.A.at[some.start]] += tall(VA[some]).T @ tall(F[some])
     share = len(is_chosen) / max(is_chosen.sum(), 1)
     AVF, diagonal = roots.mix(AVF[:-1]), np.diag(sums.FF)[n:]
     return f * sums.AF[:, n:] + share * AVF, f * diagonal + share * FVF
