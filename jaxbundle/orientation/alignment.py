@@ -12,7 +12,6 @@ from jaxbundle.orientation import batched
 from jaxbundle.orientation.incremental import Model, are_controlled
 from jaxbundle.orientation.rays import Sights
 from jaxbundle.orientation.robust import OUTLIER_LIMIT
-from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 from jaxbundle.types import Index
 
 # A and t of X' = A·X + t, A a rotation times a scale.
@@ -158,38 +157,6 @@ def _by_an_image(model: Model, part: Model, image: Index, scale: float) -> Simil
     shift."""
     A = scale * model.M[image].T @ part.M[image]
     return A, model.X0[image] - A @ part.X0[image]
-
-
-def describe_mirror(network: Network, model: Model, settings: StartValueSettings = DEFAULTS) -> str:
-    """Whether a model in an arbitrary frame fits the control points only as a mirror image, in
-    words; empty if not, or if undecidable (fewer than four, or coplanar)."""
-    points = network.points
-    control = are_controlled(points) & model.known
-    source, target = model.X[control], points.position[control]
-    if len(source) < 4:  # a triangle turned over is its own mirror image
-        return ""
-    misfits = [_misfit(source, target * axes) for axes in ([1, 1, 1], [-1, 1, 1])]
-    extent = float(np.ptp(target, axis=0).max())
-    # Five times better as a mirror image: in 18 000 trials with 4 to 8 points and noise of 0.5 % of
-    # their extent no right model was called one (with 2.5 two were); of mirror images with heights
-    # of half the extent 81 to 99 % are found (with ten 61 to 96 %), of flat ones hardly any.
-    if not misfits[1] < min(misfits[0] / 5, extent / settings.extent_to_misfit):
-        return ""
-    return (
-        f"the {len(source)} control points fit the images only as a mirror image (by "
-        f"{misfits[1]:.3g} {network.object_unit}, otherwise {misfits[0]:.3g}): X and Y are "
-        "exchanged, or one of X, Y, Z has the wrong sign, or the image coordinates count y "
-        "downward; reverse one axis"
-    )
-
-
-def _misfit(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> float:
-    """The median distance of points after the similarity that takes one list to the other."""
-    transformation = similarity(source, target)
-    if transformation is None:
-        return np.inf
-    A, t = transformation
-    return float(np.median(np.linalg.norm(source @ A.T + t - target, axis=1)))
 
 
 def similarity(

@@ -31,7 +31,8 @@ from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import batched
-from jaxbundle.orientation.alignment import describe_mirror, join, move_to_given_frame, to_scale
+from jaxbundle.orientation.alignment import join, move_to_given_frame, to_scale
+from jaxbundle.orientation.control_axes import describe_wrong_axes
 from jaxbundle.orientation.image_conventions import name_image_extent
 from jaxbundle.orientation.incremental import (
     Improve,
@@ -177,7 +178,9 @@ def find_start_values(
     sights = make_sights(network, tolerance)
     model, frame = _orient(network, sights, improve and partial(improve, network), settings)
     if not model.placed.any():
-        why = _describe_mirror(network, sights, settings) or _why_nothing(network, sights, settings)
+        why = _describe_wrong_axes(network, sights, settings) or _why_nothing(
+            network, sights, settings
+        )
         raise _no_start_values(network, why)
     oriented = _result(network, sights, model, frame, settings)
     # Control points that most of their rays miss grossly.
@@ -189,7 +192,7 @@ def find_start_values(
     why = ""
     if _control_contradicts(network, sights, model, settings):
         # A datum needs three control points; with as many left the wrong ones are only excluded.
-        why = _describe_mirror(network, sights, settings) or (
+        why = _describe_wrong_axes(network, sights, settings) or (
             finding if remaining_control < 3 else ""
         )
     if why:
@@ -231,10 +234,14 @@ def _control_contradicts(
     )
 
 
-def _describe_mirror(network: Network, sights: Sights, settings: StartValueSettings) -> str:
-    """Whether a model without control fits it only as a mirror image, in words."""
+def _describe_wrong_axes(network: Network, sights: Sights, settings: StartValueSettings) -> str:
+    """Whether a model without control fits it only with other axes, in words."""
     model = _grow_from_a_pair(network, sights, Model.empty(sights), None, settings)
-    return "" if model is None else describe_mirror(network, model, settings)
+    if model is None:
+        return ""
+    control = are_controlled(network.points) & model.known
+    positions = model.X[control], network.points.position[control]
+    return describe_wrong_axes(*positions, network.object_unit, settings=settings)
 
 
 def _orient(

@@ -99,12 +99,13 @@ class ControlPoint:
 @dataclasses.dataclass(frozen=True)
 class ControlTable:
     """The `points`, where their σ come from (`sigma`, in words), further `notes`; `unit` of
-    lengths."""
+    lengths; `warnings`: what makes the frame doubtful."""
 
     points: tuple[ControlPoint, ...]
     sigma: str
     notes: tuple[str, ...]
     unit: str
+    warnings: tuple[str, ...] = ()
 
     def rms(self, role: str) -> Float[np.ndarray, "3"]:
         """RMS residual in X, Y, Z of the used control points, or of the check points; NaN without

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from jaxbundle.adjustment.likely_causes import CAUSES
 from jaxbundle.adjustment.quality.control_prediction import predict_measurements
 from jaxbundle.adjustment.result import Adjustment
 from jaxbundle.cameras import get_model
@@ -33,6 +34,7 @@ from jaxbundle.reconstruction.control_choice import (
     with_heights_as_in_plane,
     without_unknown_heights,
 )
+from jaxbundle.reconstruction.control_mistakes import refuse_wrong_axes, refuse_wrong_columns
 from jaxbundle.reconstruction.control_table import (
     ControlMeasurement,
     ControlPoint,
@@ -64,12 +66,14 @@ def georeference(
     tell("control points")
     block = OrientedBlock(weighted.adjustment, frame, settings or ControlSettings())
     measured = block.resolve()
+    refuse_wrong_columns(block, measured)
     control, heights = without_unknown_heights(block)
     usable = [
         k
         for k, id in enumerate(control.id)
         if control.role[k] != "check" and block.is_determined(id, measured[id])
     ]
+    doubt = refuse_wrong_axes(block, control, usable)
     # Rays and intersections again, in the frame of control.
     if not block.has_positions:
         block.move(usable, control)
@@ -116,7 +120,13 @@ def georeference(
     notes = [heights] * bool(heights) + choice.remarks()
     notes += [f"data snooping removed {name}" for name in _removed_of_control(result, control)]
     notes += [] if positions is None else positions.contradictions(block.settings.offset_sigma, "m")
-    table = ControlTable(tuple(_tabulate(result, block, control, choice)), words, tuple(notes), "m")
+    warnings = [doubt] * bool(doubt)
+    # Stated σ that are so far off are those of another unit or axis, as of rays.
+    if choice.assessment.factor > CAUSES.max_sigma0:
+        warnings.append(f"control does not fit the photographs: {words}")
+    table = ControlTable(
+        tuple(_tabulate(result, block, control, choice)), words, tuple(notes), "m", tuple(warnings)
+    )
     return dataclasses.replace(weighted, adjustment=result, agreeing_rays=int(is_used.sum())), table
 
 

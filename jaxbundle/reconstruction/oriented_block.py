@@ -6,7 +6,8 @@ similarity.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -209,22 +210,34 @@ class OrientedBlock:
             for id, point in measured.items()
         }
 
+    def smallest_miss(self, point: MeasuredPoint) -> float:
+        """The least distance of a measurement from where the rays of two of them come nearest to
+        each other, the larger one of the two, pixels; infinite without two rays."""
+        return min((misses[pair].max() for pair, misses in self._pairs(point)), default=np.inf)
+
+    def _pairs(
+        self, point: MeasuredPoint
+    ) -> Iterator[tuple[Int[np.ndarray, "2"], Float[np.ndarray, " n"]]]:
+        """Pairs of rays, and the misses of all measurements from the point that they give."""
+        usable = np.flatnonzero(np.isfinite(point.rays).all(1))
+        rays_tried = usable[batched.evenly_spaced(len(usable), self.settings.paired_rays)]
+        for i, j in itertools.combinations(rays_tried, 2):
+            pair = np.isin(np.arange(len(point.rows)), [i, j])
+            yield np.array([i, j]), self.misses(point, self._intersect(point, pair))
+
     def _find_consistent(self, point: MeasuredPoint) -> MeasuredPoint:
         """The largest set of rays that meet, more than half of them, from the best pair."""
         usable = np.flatnonzero(np.isfinite(point.rays).all(1))
         best = np.zeros(len(point.rows), bool)
         closest = np.inf
-        rays_tried = usable[batched.evenly_spaced(len(usable), self.settings.paired_rays)]
-        for i in rays_tried:
-            for j in rays_tried[rays_tried > i]:
-                pair = np.isin(np.arange(len(point.rows)), [i, j])
-                misses = self.misses(point, self._intersect(point, pair)) / point.sigma
-                good = misses < self.settings.wrong_ray
-                if good[[i, j]].all() and (good.sum(), -np.median(misses[good])) > (
-                    best.sum(),
-                    -closest,
-                ):
-                    best, closest = good, np.median(misses[good])
+        for pair, misses_in_pixels in self._pairs(point):
+            misses = misses_in_pixels / point.sigma
+            good = misses < self.settings.wrong_ray
+            if good[pair].all() and (good.sum(), -np.median(misses[good])) > (
+                best.sum(),
+                -closest,
+            ):
+                best, closest = good, np.median(misses[good])
         if best.sum() < 2 or 2 * best.sum() <= len(usable):
             return dataclasses.replace(point, good=np.zeros(len(point.rows), bool))
         return dataclasses.replace(point, good=best, position=self._intersect(point, best))

@@ -552,6 +552,8 @@ class _ReconstructionRun:
                 self._warn(f"{name}: control is not used: {error}", np.inf)
             self._begin("")
         result = weighted.adjustment
+        for doubt in () if control is None else control.warnings:
+            self._warn(f"{name}: {doubt}", np.inf)
         if control is not None and self.system:
             below = name_view_from_below(result.image_values)
             if below:

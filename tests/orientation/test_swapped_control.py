@@ -145,22 +145,6 @@ def test_two_exchanged_points_of_very_many_are_found():
     assert contradiction(source, target).exchanges == [(20, 71)]
 
 
-@pytest.mark.parametrize("mirrored, said", [(0.15, True), (0.25, False)])
-def test_control_is_a_mirror_image_if_it_fits_five_times_better_as_one(
-    monkeypatch, mirrored, said
-):
-    """With a misfit that is small for its extent."""
-    monkeypatch.setattr(alignment, "_misfit", lambda source, target: (
-        1.0 if (target == X).all() else mirrored
-    ))  # fmt: skip
-    X = POINTS[:6] * 10
-    points = Points(tuple("abcdef"), ("control",) * 6, X, np.full((6, 3), 0.01))
-    network = SimpleNamespace(points=points, object_unit="m")
-    model = SimpleNamespace(known=np.ones(6, bool), X=X)
-    told = alignment.describe_mirror(network, model)
-    assert ("the 6 control points fit the images only as a mirror image (by 0.15 m" in told) == said
-
-
 @pytest.mark.parametrize("known, expected", [
     ({"control": 1.0, "rays": 2.0, "points": 3.0}, 1.0), ({"rays": 2.0, "points": 3.0}, 2.0),
     ({"points": 3.0}, 3.0), ({}, None),

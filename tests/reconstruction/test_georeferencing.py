@@ -93,6 +93,39 @@ def test_the_ground_is_within_its_sigma(drone, good):
     assert np.all(np.abs(X - drone.truth) < 4 * sigma[rows])
 
 
+@pytest.mark.parametrize("positions", [True, False])
+def test_exchanged_axes_and_other_units_are_refused(drone, positions):
+    for X, words in (
+        (drone.truth[:, [1, 0, 2]], "9 control points fit the images only as a mirror image"),
+        (drone.truth * [1, 1, 1 / 0.3048], "9 control points fit the images only with heights in"),
+    ):
+        with pytest.raises(InputError, match=words):
+            controlled(drone, drone.given(X, positions=positions))
+
+
+def test_control_that_fits_better_as_a_mirror_image_is_doubted(drone, handheld):
+    """Noise of a handheld receiver leaves it less than five times better."""
+    *_, table = controlled(drone, drone.given(handheld[:, [1, 0, 2]], positions=False))
+    assert len(table.warnings) == 1 and "only as a mirror image" in table.warnings[0]
+
+
+@pytest.mark.parametrize("columns, words", [
+    (lambda xy: xy[:, ::-1], "rays of 0 meet.* with u and v exchanged those of 9 meet"),
+    (lambda xy: xy * [1, -1] + [0, 1499], "rays of 0 meet.* with v counted from the top .* of 9"),
+    (lambda xy: xy / 2, "rays of 0 meet.* u and v are pixels of the photographs as they are"),
+])  # fmt: skip
+def test_image_points_in_wrong_columns_are_named(drone, columns, words):
+    named = dataclasses.replace(drone.named, xy=columns(drone.named.xy))
+    with pytest.raises(InputError, match=words):
+        controlled(drone, drone.given(drone.truth, positions=False, named=named))
+
+
+def test_stated_sigma_that_are_far_too_small_are_a_warning(drone, handheld):
+    """2 mm of coordinates with errors of 0.5 m."""
+    *_, table = controlled(drone, drone.given(handheld, 0.002, positions=False))
+    assert len(table.warnings) == 1 and "multiplied by" in table.warnings[0]
+
+
 @pytest.fixture(scope="module", params=[
     pytest.param(positions, marks=pytest.mark.further) for positions in (True, False)
 ], ids=["positions", "no positions"])  # fmt: skip
