@@ -256,14 +256,14 @@ def snoop_again(
 
 
 def _orient(network: Network, mirror: Callable[[float | None], str]) -> Oriented:
-    """Start values of most of a network; an error names mirrored control if that explains it."""
+    """Start values of most of a network; an error also names mirrored control if that might explain
+    it."""
     try:
         return require_most_oriented(orient(network))
     except NotSolvedError as error:
         if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
-            raise NotSolvedError(
-                f"no start values found: {mirrored}", [*error.undetermined]
-            ) from None
+            # The images decide which: of points in a plane both may fit the tolerance.
+            raise NotSolvedError(f"{error}; or {mirrored}", [*error.undetermined]) from None
         raise
 
 

@@ -36,6 +36,7 @@ from jaxbundle.io.writing.folders import check_folder, keep_inputs, replace_fold
 from jaxbundle.network.columns import list_some
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.orientation.swapped_control import CONTRADICTORY_CONTROL
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.budget import budget_lines
@@ -413,7 +414,11 @@ def report_with(
 def why_not(result: Adjustment) -> str:
     """Why an adjustment did not converge, and the remedy."""
     parts = [f"not solved: {result.termination}"]
-    if result.undetermined:
+    # Wrong control bends the network, and whatever is then weak is no remedy.
+    warnings = result.problem.network.warnings
+    if contradictions := [line for line in warnings if CONTRADICTORY_CONTROL in line]:
+        parts += contradictions
+    elif result.undetermined:
         parts.append(f"not determined: {list_some(result.undetermined, 12, str)}")
         parts.append("fix them, give them a prior σ, or add measurements that determine them")
         parts += result.findings

@@ -187,7 +187,7 @@ def find_start_values(
     gross_counts = np.bincount(sights.point, _are_gross(sights, model, settings), sights.points)
     rays = _ray_counts(sights, model)
     is_missed = are_held(network.points, settings) & (2 * gross_counts > rays)
-    finding = name_contradiction(network, sights, model, settings) if is_missed.any() else ""
+    finding = _name_contradiction(network, sights, model, settings) if is_missed.any() else ""
     remaining_control = (are_controlled(network.points) & ~is_missed & (rays > 0)).sum()
     why = ""
     if _control_contradicts(network, sights, model, settings):
@@ -231,6 +231,17 @@ def _control_contradicts(
     return bool(control.any()) and bool(
         is_gross[control_rays].sum() > settings.contradicted_share * control_rays.sum()
         or is_not_intersected.sum() > settings.contradicted_share * seen_twice.sum()
+    )
+
+
+def _name_contradiction(
+    network: Network, sights: Sights, model: Model, settings: StartValueSettings
+) -> str:
+    """How control points contradict each other, in words."""
+    # By images oriented without them: those oriented by wrong points fit them in part.
+    free_model = _grow_from_a_pair(network, sights, Model.empty(sights), None, settings)
+    return name_contradiction(
+        network, sights, model if free_model is None else free_model, settings
     )
 
 
