@@ -354,8 +354,9 @@ def _observations(
             f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
             f"sigma in [refine] for those without"
         )
+    index, where_images = {id: k for k, id in enumerate(images)}, f"{section.file.path}, [images]"
     return Observations(
-        table.indices("image", "image", {id: k for k, id in enumerate(images)}, section.where),
+        table.indices("image", "image", index, where_images),
         table.indices("point", "point", ids, where_points),
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
         np.where(is_missing, sigma, stated_sigma),
