@@ -296,7 +296,7 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
 
     **Arguments:**
 
-    - `scanner`: scanner file; `truth`: that of the truth.
+    - `scanner`: scanner file; `truth`: that of the truth, whose errors need no σ.
     - `attitude_…`, `position_…`: σ in degrees and metres, of drifts per second.
     - `draws`: of a Monte Carlo simulation in addition to propagation; `seed`: of it.
     - `grid`: parts of the image, lines × pixels, a row of the table each.
@@ -305,6 +305,17 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
     **Raises:** `InputError`.
     """
     check_draws(draws)
+    degree = np.pi / 180
+    noise = Noise(
+        degree * attitude_bias,
+        degree * attitude_drift,
+        degree * attitude_white,
+        position_bias,
+        position_drift,
+        position_white,
+    )
+    if truth is not None:
+        _refuse_beside_truth(noise, draws)
     file = open_scanner(scanner, tell)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     size = file.image.lines, file.image.pixels
@@ -337,15 +348,6 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
             "ce90": float(np.nanquantile(length, 0.9)),
         }
     else:
-        degree = np.pi / 180
-        noise = Noise(
-            degree * attitude_bias,
-            degree * attitude_drift,
-            degree * attitude_white,
-            position_bias,
-            position_drift,
-            position_white,
-        )
         if not any(noise):
             raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
         if isinstance(surface, Terrain):
@@ -367,3 +369,14 @@ def accuracy(  # noqa: PLR0913 (public: the options of the command, all but one 
                 "draws": draws,
             }
     return ScannerTable(columns, {"scanner": file.name, **figures, "positions": len(line)})
+
+
+def _refuse_beside_truth(noise: Noise, draws: int) -> None:
+    """Refuse σ of errors, or draws of them, where the truth shows the errors themselves."""
+    for name, value in (*noise._asdict().items(), ("draws", draws)):
+        if value:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(
+                f"--truth and {option}: errors against a truth do not depend on {option}; give "
+                "one of them"
+            )

@@ -173,6 +173,9 @@ def test_what_is_refused(tmp_path, flight, run):
     scanner = tmp_path / "out" / "scanner.toml"
     for arguments, words in [
         (["accuracy", scanner], ["no σ", "--attitude-white"]),
+        (["accuracy", scanner, "--truth", scanner, "--attitude-white", 5],
+         ["--truth and --attitude-white", "one of them"]),
+        (["accuracy", scanner, "--truth", scanner, "--draws", 20], ["--truth and --draws"]),
         (["accuracy", flight, "--table", "bias", "--draws", 1], ["--draws 1", "at least 20"]),
         (["accuracy", scanner, "--map", "a.jpg"], ["a.jpg", ".tif or .png"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--truth",
