@@ -29,6 +29,10 @@ EARTH_RATE = 7.292115e-5
 # Geocentric gravitational constant, m³/s² (WGS 84).
 GM = 3.986004418e14
 ARCSECOND = np.pi / 648000
+# The equator of WGS 84, metres, above which the height of an orbit is.
+EQUATOR = 6378137.0
+# The edge of space (FAI), metres: lower satellites are stopped by the air within a revolution.
+LOWEST_ORBIT = 100e3
 # Seconds of a day; ERFA's quasi Julian date of UTC stretches the day of a leap second.
 DAY = 86400.0
 
@@ -161,22 +165,37 @@ def two_line_orbit(
     return turn_positions(R, 1e3 * km, 1e3 * km_s, orientation)
 
 
+def check_orbit_height(height: float, where: str = "") -> None:
+    """Refuse the height of a circular orbit on which no satellite stays, metres; `where` begins
+    the message.
+
+    **Raises:** `InputError`."""
+    if not height >= LOWEST_ORBIT:
+        raise InputError(
+            f"{where}height is {height:g}; expected metres above the equator, {LOWEST_ORBIT:g} or "
+            "more of an orbit: is it in kilometres?"
+        )
+
+
 def circular_orbit(
     times: Float[np.ndarray, " rows"],
     height: float,
     inclination: float,
     node: float = 0.0,
     argument: float = 0.0,
-    radius: float = 6378137.0,
+    radius: float = EQUATOR,
 ) -> tuple[Rows, Rows]:
     """Earth-fixed positions (m) and velocities (m/s) on a circular orbit about the rotating Earth.
 
     **Arguments:** `height` above a sphere of this `radius` (WGS 84: its semi-major axis), metres;
     `inclination`; longitude of the ascending `node` and `argument` of latitude at t = 0, radians.
     Kepler's rate, no perturbations.
+
+    **Raises:** `InputError` for an orbit on which no satellite stays.
     """
     times = np.asarray(times, float)
     r = radius + height
+    check_orbit_height(r - EQUATOR)
     rate = np.sqrt(GM / r**3)
     u = argument + rate * times
     plane = _rotations_about("z", node - EARTH_RATE * times) * _rotations_about(

@@ -70,6 +70,19 @@ def flight(tmp_path):
     return path
 
 
+@pytest.mark.parametrize("track, words", [
+    ("height = -505000.0", "height is -505000; expected metres"),
+    ("height = 505.0", "height is 505; expected metres"),
+    ("start = [100, 6, -505000]\nend = [100, 6.1, 505000]", "start: the position is 5.87"),
+])  # fmt: skip
+def test_a_track_inside_the_earth_is_refused_as_its_result_would_be(flight, run, track, words):
+    text = FLIGHT.replace('earth = "local"\n', "")
+    flight.write_text(text[: text.index("start")] + track + text[text.index("\n\n[angles]") :])
+    status, _, err = run("simulate", flight, "--out", flight.parent / "out")
+    assert status == 2 and len(err.splitlines()) == 1 and not (flight.parent / "out").exists()
+    assert f"{flight}, [track]: {words}" in err and "is it in kilometres" in err, err
+
+
 @pytest.mark.parametrize("seed", ["1.7", "-1"])
 def test_a_seed_is_a_whole_number(flight, seed):
     flight.write_text(FLIGHT.replace("seed = 3", f"seed = {seed}"))

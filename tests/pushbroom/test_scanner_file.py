@@ -89,6 +89,10 @@ BROKEN = {
         'table = "positions.csv"', "circle = { height = 5e5, inclinaton = 98 }\nspan = [-6, 11]",
         ["[position]", "circle", "did you mean 'inclination'"],
     ),
+    "circle in kilometres": (
+        'table = "positions.csv"', "circle = { height = 505 }\nspan = [-6, 11]",
+        ["[position]: circle: height is 505;", "is it in kilometres?"],
+    ),
     "no circle": ('table = "positions.csv"', "circle = 5\nspan = [-6, 11]", ["circle is 5"]),
     "no elements": ('table = "positions.csv"', "tle = [1, 2]\nspan = [0, 9]", ["tle", "quotes"]),
     "no width": (

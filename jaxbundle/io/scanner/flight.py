@@ -43,7 +43,14 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
-from jaxbundle.io.scanner.scanner_file import ANGLES, earth_of, mounting_of, optics_of
+from jaxbundle.io.scanner.scanner_file import (
+    ANGLES,
+    check_outside,
+    earth_of,
+    mounting_of,
+    optics_of,
+    read_orbit_height,
+)
 from jaxbundle.io.text.sections import TomlFile, TomlSection, read_sections
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.pushbroom.flight import Flight
@@ -132,7 +139,7 @@ def _read_track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
         return {"state": track.numbers("state", 6), "at": track.number("at", 0.0), "j2": j2}
     track.check_keys(ORBIT)
     angles = {k: file.radians * track.number(k, 0.0) for k in ORBIT[1:]}
-    return {"height": track.number("height"), **angles}
+    return {"height": read_orbit_height(track), **angles}
 
 
 def _end_position(track: TomlSection, key: str, radians: float, earth: Ellipsoid) -> np.ndarray:
@@ -144,7 +151,9 @@ def _end_position(track: TomlSection, key: str, radians: float, earth: Ellipsoid
             "height, in the unit of angles and metres"
         )
     geographic = radians * longitude, radians * latitude, height
-    return np.array([float(v) for v in earth_fixed(earth, geographic)])
+    position = np.array([float(v) for v in earth_fixed(earth, geographic)])
+    check_outside(position[None], earth, lambda _: f"{track.where}{key}")
+    return position
 
 
 def _sigma(section: TomlSection, name: str, radians: float) -> Sigma:

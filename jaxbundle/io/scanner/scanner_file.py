@@ -56,7 +56,7 @@ refraction = true
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -277,13 +277,15 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[TimeTable, Sourc
         R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
         P, V = frames.turn_positions(R, P, V, _orientation(file))
     if earth is not None:
-        _check_outside(P, earth, columns.source)
+        check_outside(P, earth, columns.source)
     table = position_table(t, P, V, **_options(section, "lagrange"), source=columns.source)
     return table, columns.source
 
 
-def _check_outside(P: Float[np.ndarray, "n 3"], earth: Ellipsoid, source: Source) -> None:
-    """Refuse positions deep inside the Earth, such as in kilometres."""
+def check_outside(
+    P: Float[np.ndarray, "n 3"], earth: Ellipsoid, source: Callable[[int], str]
+) -> None:
+    """Refuse positions deep inside the Earth, such as in kilometres; `source` names rows."""
     distance = np.linalg.norm(P, axis=1)
     # A hundredth of the axis, 64 km: no camera is so deep.
     min_distance = 0.99 * min(float(earth.a), float(earth.b), float(earth.c))
@@ -346,9 +348,18 @@ def _orbit(
         circle.check_keys(CIRCLE)
         angles = (circle.number(k, 0.0) for k in CIRCLE[1:])
         angles = [file.radians * angle for angle in angles]
-        P, V = frames.circular_orbit(t, circle.number("height"), *angles)
+        P, V = frames.circular_orbit(t, read_orbit_height(circle), *angles)
     source = Source(f"{section.where}span")
     return position_table(t, P, V, **_options(section, "lagrange"), source=source), source
+
+
+def read_orbit_height(section: TomlSection) -> float:
+    """The height of a circular orbit, metres.
+
+    **Raises:** `InputError` where no satellite stays."""
+    height = section.number("height")
+    frames.check_orbit_height(height, section.where)
+    return height
 
 
 def _attitude(
