@@ -26,12 +26,15 @@ from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.rasters.extent import pole_in_image
 from jaxbundle.io.rasters.geoid import undulations_at
 from jaxbundle.io.rasters.maps import MapSystem
-from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
+from jaxbundle.io.scanner.rpc import read_rpc, read_stated_errors, write_rpc
 from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.io.text.known_keys import UnknownKeys
 from jaxbundle.leastsquares.quality.distributions import critical_w
+from jaxbundle.leastsquares.quality.global_test import contradicts
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.rpc.bias import (
+    MODELS,
+    BiasFit,
     RpcBias,
     apply_bias,
     check_domain,
@@ -40,6 +43,8 @@ from jaxbundle.pushbroom.rpc.bias import (
 )
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, fit_image, fit_rpc
 from jaxbundle.pushbroom.rpc.polynomials import Rpc, RpcStatus, locate_points_on, project_points
+from jaxbundle.refinement.beyond_priors import describe_beyond
+from jaxbundle.refinement.rpc_points import names_of_terms, prior_of_errors
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import not_none
 
@@ -185,11 +190,12 @@ def compensate(
     control: str | Path,
     *,
     model: str = "shift",
-    sigma: float = 1.0,
+    sigma: float | None = None,
     snooping: str = "none",
     significance: float = 0.001,
     crs: str | None = None,
     geoid: str | Path | None = None,
+    tell: Message = ignore,
 ) -> ScannerRpc:
     """Remove the bias of coefficients that control points show. Of arrays: `fit_bias`,
     `apply_bias`.
@@ -199,11 +205,13 @@ def compensate(
     - `control`: table longitude, latitude, height, line, sample[, id, role, seast, snorth, sheight]
       (degrees, metres, pixels); `role` is `control`, the default, or `check`: compared only.
     - `model`: "shift", "affine" or "quadratic", in the image; `sigma`: of measured lines and
-      samples, pixels.
+      samples, pixels; 1, a unit of weight that is not tested, if None.
     - `snooping`: "none", "baarda" or "pope": points whose w is beyond the limit of this
       `significance` are left out, the worst one first.
     - `crs`: a projected system, in which the table has x and y instead of longitude and latitude;
       `geoid`: heights are above it, as of `locate`.
+    - `tell`: called with every warning: residuals that contradict `sigma`, a bias beyond the errors
+      that the coefficients state.
 
     **Returns:** the compensated coefficients; of every point residuals, of control points
     redundancy numbers and w, and what it was used for; the bias with σ, the RMS of check points.
@@ -221,22 +229,21 @@ def compensate(
     if any(name in columns.values for name in GROUND_SIGMA):
         ground = np.stack([columns.numbers(name, required=True) for name in GROUND_SIGMA], 1)
     role = _roles(columns)
-    # The others are checked by the fit.
-    check = np.flatnonzero(role == "check")
+    check, control_rows = (np.flatnonzero(role == word) for word in ("check", "control"))
     rows_of_table = lambda rows: RpcTable(*(np.asarray(column)[rows] for column in table))
-    check_domain(rpc, rows_of_table(check), columns.source.take(check))
     fit = lambda rows: fit_bias(
         rpc,
         rows_of_table(rows),
         model=model,
-        sigma=sigma,
+        sigma=1.0 if sigma is None else sigma,
         ground_sigma=ground[rows],
         source=columns.source.take(rows),
     )
-    control_rows = np.flatnonzero(role == "control")
     if not len(control_rows):
         raise InputError(f"{columns.source.name}: no control point; role is check in all rows")
     compensation = fit(control_rows)
+    # The fit has checked the others.
+    check_domain(rpc, rows_of_table(check), columns.source.take(check))
     while snooping != "none" and compensation.redundancy > 0:
         w = np.nan_to_num(np.abs(compensation.w))
         limit = critical_w(
@@ -250,6 +257,9 @@ def compensate(
         role[control_rows[worst]] = "removed"
         control_rows = np.delete(control_rows, worst)
         compensation = fit(control_rows)
+    if sigma is not None:
+        _tell_misfit(compensation, sigma, columns.source.name, tell)
+    _tell_beyond_stated(compensation, rpc, Path(coefficients), significance, tell)
     changed, remainder = apply_bias(rpc, compensation.bias)
     # The same terms in lines and in samples.
     k = len(compensation.cofactor) // 2
@@ -282,6 +292,36 @@ def compensate(
         rows |= {f"r_{axis}": in_all_rows(compensation.redundancy_numbers[:, i])}
         rows |= {f"w_{axis}": in_all_rows(compensation.w[:, i])}
     return ScannerRpc(rows, figures, changed)
+
+
+def _tell_misfit(compensation: BiasFit, sigma: float, name: str, tell: Message) -> None:
+    """That residuals of control are larger than their stated σ by more than chance explains."""
+    sigma0, redundancy = compensation.sigma0, compensation.redundancy
+    if redundancy > 0 and sigma0 > 1 and contradicts(sigma0, redundancy):
+        tell(
+            f"{name}: residuals are {sigma0:.3g} times as large as --sigma {sigma:g} pixel and the "
+            "σ of the points imply (sigma0); look for blunders (--snooping pope) and points of "
+            "another image, or give larger σ"
+        )
+
+
+def _tell_beyond_stated(
+    compensation: BiasFit, rpc: Rpc, path: Path, significance: float, tell: Message
+) -> None:
+    """That the bias is beyond the errors that the coefficients state of themselves."""
+    errors, terms = read_stated_errors(path), len(compensation.cofactor) // 2
+    if not any(errors):
+        return
+    # What is not stated is not compared.
+    prior = prior_of_errors(rpc, list(MODELS.values()).index(terms), *(e or np.inf for e in errors))
+    bias = np.r_[compensation.bias.line[:terms], compensation.bias.sample[:terms]]
+    # The bias is estimated without the prior: its own σ, a priori, adds to that.
+    ratio = np.abs(bias) / np.hypot(prior.ravel(), np.sqrt(np.diag(compensation.cofactor)))
+    if beyond := describe_beyond(names_of_terms(terms), ratio, significance):
+        tell(
+            f"{path}: beyond the errors that it states (ERR_BIAS {errors.bias:g} m, ERR_RAND "
+            f"{errors.random:g} m; 0: not stated): {beyond}"
+        )
 
 
 def _roles(columns: Columns) -> np.ndarray:

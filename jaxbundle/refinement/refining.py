@@ -16,7 +16,6 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix
-from jaxbundle.leastsquares.quality.distributions import normal_quantile
 from jaxbundle.leastsquares.quality.global_test import chi_squared_test
 from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
 from jaxbundle.network.blunders import Removed
@@ -27,6 +26,7 @@ from jaxbundle.pushbroom.rpc.bias import RpcBias, apply_bias
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck
 from jaxbundle.pushbroom.rpc.image import RpcImage
 from jaxbundle.pushbroom.rpc.polynomials import RpcStatus
+from jaxbundle.refinement.beyond_priors import describe_beyond
 from jaxbundle.refinement.build import check_input, choose_rays, start_points
 from jaxbundle.refinement.check_points import RefinementCheckPoints, intersect
 from jaxbundle.refinement.declare import declare
@@ -361,14 +361,8 @@ def refine(
 def _beyond_priors(result: Refinement, significance: float) -> Iterator[str]:
     """Unknowns that leave their priors by more than chance explains, as a warning."""
     ratio = np.abs(result.estimate - result.prior_change) / result.prior_sigma
-    limit = normal_quantile(1 - significance / 2)
-    beyond = sorted(np.flatnonzero(ratio > limit), key=lambda k: -ratio[k])
-    if beyond:
-        listed = list_some([f"{result.names[k]} ({ratio[k]:.3g} σ)" for k in beyond], 3, str)
-        yield (
-            f"beyond their priors: {listed}; check heights (ellipsoid or geoid, metres or feet) "
-            "and the system of the points, or the priors"
-        )
+    if beyond := describe_beyond(result.names, ratio, significance):
+        yield f"beyond their priors: {beyond}, or the priors"
 
 
 def _without_terrain(inspection: RefinementInspection) -> Iterator[str]:

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
+from jaxbundle.pushbroom.exchanged_columns import refuse_exchanged
 from jaxbundle.refinement.inputs import RefinementInput
 
 
@@ -18,21 +19,8 @@ def check_columns(
     for i in np.unique(image):
         is_of_image = (image == i) & (role != "tie")
         xy = observations.xy[rows][is_of_image]
-        # Three points are not all on the diagonal, or near another's place, by chance.
-        if len(xy) < 3:
-            continue
-        distance, distance_exchanged = (
-            np.median(np.linalg.norm(xy + v[is_of_image] - places, axis=1))
-            for places in (xy, xy[:, ::-1])
-        )
-        # An order of magnitude: start values explain a hundred pixels, but not that these vanish.
-        if distance > 10 * distance_exchanged:
-            raise InputError(
-                f"{observations.source.name}: line and pixel seem to be exchanged in image "
-                f"{inputs.ids[i]!r}: points with given coordinates are {distance:.0f} pixels from "
-                f"their measurements (median), and {distance_exchanged:.0f} with line and pixel "
-                "exchanged; check the names of the columns"
-            )
+        name, where = observations.source.name, f" in image {inputs.ids[i]!r}"
+        refuse_exchanged(xy, xy + v[is_of_image], name, where)
 
 
 def check_near(

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import sys
 
 import numpy as np
@@ -11,9 +12,10 @@ from rpc_scenes import made_up, table_of
 from scanner_files import write_scanner
 
 from jaxbundle import cli
-from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
+from jaxbundle.io.scanner.rpc import StatedErrors, read_rpc, write_rpc
 from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.pushbroom.rpc.fitting import RpcTable, check_rpc
+from jaxbundle.pushbroom.rpc.polynomials import project_points
 
 RPC = made_up(longitude_offset=12.3)
 COLUMNS = ("longitude", "latitude", "height", "line", "sample")
@@ -139,6 +141,43 @@ def test_a_bias_is_removed(tmp_path, run):
     assert told["sample_shift"] == pytest.approx(-9, abs=1e-9)
     shifted = RpcTable(*true[:3], true.line + told["line_shift"], true.sample - 9)
     assert check_rpc(read_rpc(tmp_path / "b.txt"), shifted).largest.max() < 1e-6
+
+
+@pytest.mark.parametrize("sigma, residuals_said", [(None, False), (0.02, True), (0.12, False)])
+def test_contradicted_sigma_and_stated_errors_are_said(tmp_path, run, sigma, residuals_said):
+    """Of a shift of 4 lines, σ of the prior are an error of the ground of 2 m, projected."""
+    write_rpc(tmp_path / "a.txt", RPC, StatedErrors(bias=2.0))
+    true, noise = table_of(RPC, (3, 3, 2)), 0.1 * np.random.default_rng(0).normal(size=(2, 18))
+    measured = true._replace(line=true.line + 4 + noise[0], sample=true.sample + noise[1])
+    control = write_table(tmp_path / "control.csv", measured)
+    given = "compensate", tmp_path / "a.txt", "--control", control, "--out", tmp_path / "b.txt"
+    status, out, err = run(
+        *given, "--json", "-", *(["--sigma", sigma] if sigma is not None else [])
+    )
+    told = json.loads(out)
+    residuals = f"control.csv: residuals are {told['sigma0']:.3g} times as large as --sigma"
+    assert status == 0 and (residuals in err) == residuals_said
+    place = np.radians([12.3, -23.4])
+    metre = 1 / (6378137 * np.array([np.cos(place[1]), 1]))  # of a sphere
+    steps = np.array([[0, 0], [metre[0], 0], [0, metre[1]]])
+    lines = np.asarray(project_points(RPC, *(place + steps).T, np.full(3, 400.0))[0])
+    of_measurement = (1.0 if sigma is None else sigma) / np.sqrt(18)
+    ratio = told["line_shift"] / np.hypot(2 * np.hypot(*(lines[1:] - lines[0])), of_measurement)
+    said = re.search(r"a.txt: beyond the errors that it states .*line shift \((.*) σ\);", err)
+    assert float(said[1]) == pytest.approx(ratio, rel=0.01) and "sample shift" not in err
+
+
+def test_exchanged_lines_and_samples_are_refused_as_by_refine(tmp_path, run):
+    """Where both are within the domain of the coefficients."""
+    square = made_up(longitude_offset=12.3, line_offset=2500.0, line_scale=2501.0)
+    write_rpc(tmp_path / "a.txt", square)
+    true = table_of(square, (3, 3, 2))
+    exchanged = true._replace(line=true.sample, sample=true.line)
+    control = write_table(tmp_path / "control.csv", exchanged)
+    out = tmp_path / "b.txt"
+    status, _, err = run("compensate", tmp_path / "a.txt", "--control", control, "--out", out)
+    assert status == 2 and "control.csv: line and sample seem to be exchanged: " in err
+    assert len(err.splitlines()) == 1 and not out.exists()
 
 
 def test_check_points_snooping_maps_and_heights_above_the_geoid(tmp_path, run):

@@ -92,7 +92,10 @@ def compensate(  # noqa: PLR0913 - the options of the command
     ],
     out: Out,
     model: Annotated[str, choice(RPC_BIASES, "in the image")] = "shift",
-    sigma: Annotated[float, typer.Option(help="σ of measured lines and samples, pixels")] = 1.0,
+    sigma: Annotated[
+        float | None,
+        typer.Option(help="σ of measured lines and samples, pixels; default: 1, not tested"),
+    ] = None,
     snooping: Annotated[
         str, choice(("none", *TESTS), "points beyond its limit are left out")
     ] = "none",
@@ -110,7 +113,7 @@ def compensate(  # noqa: PLR0913 - the options of the command
     """Remove the bias found by control points; print residuals, redundancy numbers and w."""
     from jaxbundle import pushbroom as line_scanners
     from jaxbundle.cli.acceptance import accept_result, check_accept, end_unmet
-    from jaxbundle.cli.pushbroom.shared import check_outputs, write_rows
+    from jaxbundle.cli.pushbroom.shared import check_outputs, warn, write_rows
     from jaxbundle.io.scanner.rpc import RASTERS
 
     check_accept(accept, "pushbroom rpc compensate")
@@ -126,6 +129,7 @@ def compensate(  # noqa: PLR0913 - the options of the command
         significance=significance,
         crs=crs,
         geoid=geoid,
+        tell=warn,
     )
     compensated.write(out)
     acceptance = accept_result(compensated, accept)

@@ -29,6 +29,7 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
 from jaxbundle.geometry.vectors import Vector, point_on_ray
 from jaxbundle.leastsquares.indexing.indices import round_up
 from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.exchanged_columns import refuse_exchanged
 from jaxbundle.pushbroom.rpc.fitting import RpcCheck, RpcTable, check_rpc, fit_rpc, plain_table
 from jaxbundle.pushbroom.rpc.polynomials import DOMAIN_MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.system.programs import compile_once
@@ -95,7 +96,8 @@ def fit_bias(
     `ground_sigma` of the points east, north, up, metres (none if None); `source` names rows.
 
     **Raises:** `InputError` for an unknown model, too few points, collinear points, invalid
-    numbers, and points or measurements outside the domain of the coefficients.
+    numbers, exchanged lines and samples, and points or measurements outside the domain of the
+    coefficients.
     """
     require_x64()
     if model not in MODELS:
@@ -119,6 +121,8 @@ def fit_bias(
             f"{source(int(bad.argmax()))}: the coefficients have no image of this point; check "
             "longitude, latitude, height and their order"
         )
+    measured = np.stack([control.line, control.sample], 1)
+    refuse_exchanged(measured, computed, source.name, columns=("line", "sample"))
     check_domain(rpc, control, source)
     # With numbers of NumPy: JAX would compile every operation for each number of points.
     terms = np.stack(bias_terms(domain_of_bias(rpc), *computed.T), 1)[:, :k]
@@ -133,7 +137,7 @@ def fit_bias(
     ground = np.zeros((n, 3)) if ground_sigma is None else np.asarray(ground_sigma, float)
     cofactors = np.einsum("nij,nj,nkj->nik", G, ground**2, G)
     cofactors = cofactors + sigma[:, :, None] ** 2 * np.eye(2)
-    return _adjust(terms, np.stack([control.line, control.sample], 1) - computed, cofactors)
+    return _adjust(terms, measured - computed, cofactors)
 
 
 def _adjust(
