@@ -313,7 +313,8 @@ def _tell_beyond_stated(
     if not any(errors):
         return
     # What is not stated is not compared.
-    prior = prior_of_errors(rpc, list(MODELS.values()).index(terms), *(e or np.inf for e in errors))
+    degree = next(k for k, number in enumerate(MODELS.values()) if number == terms)
+    prior = prior_of_errors(rpc, degree, *(e or np.inf for e in errors))
     bias = np.r_[compensation.bias.line[:terms], compensation.bias.sample[:terms]]
     # The bias is estimated without the prior: its own σ, a priori, adds to that.
     ratio = np.abs(bias) / np.hypot(prior.ravel(), np.sqrt(np.diag(compensation.cofactor)))

@@ -18,7 +18,7 @@ def describe_beyond(
     **Arguments:** `ratio` of the change of every unknown to its σ; `significance` of its test,
     two-sided."""
     limit = normal_quantile(1 - significance / 2)
-    beyond = sorted(np.flatnonzero(ratio > limit), key=lambda k: -ratio[k])
+    beyond = sorted(np.flatnonzero(ratio > limit).tolist(), key=lambda k: -ratio[k])
     if not beyond:
         return ""
     listed = list_some([f"{names[k]} ({ratio[k]:.3g} σ)" for k in beyond], 3, str)

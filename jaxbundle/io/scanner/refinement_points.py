@@ -27,6 +27,7 @@ from jaxbundle.network.columns import Columns, count, list_some
 from jaxbundle.network.tables import STATED, UNIT, Network, Observations, Source
 from jaxbundle.refinement.refining import east_north_up
 from jaxbundle.refinement.tables import AnyScannerImage, GroundPoints, check_points_table
+from jaxbundle.types import not_none
 
 GCP, MATCH, ISIS = ".gcp", ".match", (".pvl", ".net")
 MEASURED = ("image", "point", "line", "pixel", "sline", "spixel")
@@ -354,7 +355,8 @@ def _observations(
             f"{table.source(row)}: sline or spixel is missing, which other rows have; give it, or "
             f"sigma in [refine] for those without"
         )
-    index, where_images = {id: k for k, id in enumerate(images)}, f"{section.file.path}, [images]"
+    index = {id: k for k, id in enumerate(images)}
+    where_images = f"{not_none(section.file).path}, [images]"
     return Observations(
         table.indices("image", "image", index, where_images),
         table.indices("point", "point", ids, where_points),
