@@ -6,8 +6,9 @@ equations of `kinds`, statistics, blunders, check points, warnings, and the refi
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.leastsquares.quality.correlation import correlation_matrix
-from jaxbundle.leastsquares.quality.global_test import chi_squared_test
+from jaxbundle.leastsquares.quality.global_test import chi_squared_test, contradicts
 from jaxbundle.leastsquares.quality.robust import residual_lengths, robust_scale
 from jaxbundle.network.blunders import Removed
 from jaxbundle.network.columns import count, list_some
@@ -49,6 +50,17 @@ from jaxbundle.results import TableMethods, finite
 from jaxbundle.types import not_none
 
 TESTS = ("none", "baarda", "pope")
+
+
+class TerrainFit(NamedTuple):
+    """Residuals of heights of a terrain model: their number, `mean` and `rms` (metres), √(vᵀPv/Σr)
+    as their `ratio` to σ, and whether it contradicts σ more than those of other observations."""
+
+    number: int
+    mean: float
+    rms: float
+    ratio: float
+    is_contradicted: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -286,6 +298,20 @@ class Refinement(TableMethods):
             )
         ]
 
+    @functools.cached_property
+    def terrain_fit(self) -> TerrainFit | None:
+        """How the heights of the terrain model fit; None without any that is tested."""
+        rows = [row for row in self.terrain_heights() if not row["removed"]]
+        v, r = (np.array([row[name] for row in rows]) for name in ("v", "r"))
+        if not (model := self.inputs.terrain) or not r.sum() > 0:
+            return None
+        ratio = float(np.sqrt((v**2).sum() / r.sum()) / model.sigma)
+        # Where all fit as badly, or others worse, the terrain is not the cause.
+        is_contradicted = ratio > max(self.sigma0, 1.0) and contradicts(ratio, float(r.sum()))
+        return TerrainFit(
+            len(v), float(v.mean()), float(np.sqrt((v**2).mean())), ratio, is_contradicted
+        )
+
     def distances(self) -> list[dict]:
         """One row per distance used: ids of both points, v, r, w, whether it was
         removed."""
@@ -353,9 +379,8 @@ def refine(
         warnings.append(f"{weak.sentence}; only priors, if any, separate them")
     check = intersect(inspection, check_rays) if len(check_rays.points) else None
     result = Refinement(inspection, check, tuple(warnings))
-    return dataclasses.replace(
-        result, warnings=(*result.warnings, *_beyond_priors(result, significance))
-    )
+    doubts = _contradicted_terrain(result), _beyond_priors(result, significance)
+    return dataclasses.replace(result, warnings=(*result.warnings, *itertools.chain(*doubts)))
 
 
 def _beyond_priors(result: Refinement, significance: float) -> Iterator[str]:
@@ -363,6 +388,20 @@ def _beyond_priors(result: Refinement, significance: float) -> Iterator[str]:
     ratio = np.abs(result.estimate - result.prior_change) / result.prior_sigma
     if beyond := describe_beyond(result.names, ratio, significance):
         yield f"beyond their priors: {beyond}, or the priors"
+
+
+def _contradicted_terrain(result: Refinement) -> Iterator[str]:
+    """That points are not on the terrain model, as a warning."""
+    fit = result.terrain_fit
+    if fit is not None and fit.is_contradicted:
+        model = not_none(result.inputs.terrain)
+        yield (
+            f"{model.name} does not fit: residuals of {count(fit.number, 'height')} are "
+            f"{fit.ratio:.3g} times as large as their σ of {model.sigma:g} m implies (RMS "
+            f"{fit.rms:.3g} m, points on average {abs(fit.mean):.3g} m "
+            f"{'above' if fit.mean > 0 else 'below'} it); check its heights (ellipsoid or geoid, "
+            "metres or feet), its place and its age, trees and buildings, or their σ"
+        )
 
 
 def _without_terrain(inspection: RefinementInspection) -> Iterator[str]:

@@ -90,7 +90,7 @@ def report(
     checks.
 
     Correlations above `min_correlation` (the σ of one unknown is 1/√(1 − 0.9²) = 2.3 times what it
-    would be with the other known) and image points are listed, the `most` largest.
+    would be with the other known), image points and terrain heights are listed, the `most` largest.
     """
     used_points = [row for row in result.image_points() if not row["removed"]]
     lines = [*_summary(result, verdict), *_fits(result, used_points)]
@@ -103,7 +103,9 @@ def report(
         lines += ["", f"Correlations above {min_correlation:g}"]
         order = np.argsort(-np.abs(C[i, j]), kind="stable")[:most]
         lines += [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
-    lines += ["", "Image points with the largest tests", *_tests(used_points, most)]
+    heights = _heights_beside_image_points(result)
+    nouns = "Image points and terrain heights" if heights else "Image points"
+    lines += ["", f"{nouns} with the largest tests", *_tests([*used_points, *heights], most)]
     if result.removed:
         lines += ["", "Removed as blunders"]
         lines += [f"  {b.name}: |w| = {b.test:.1f}" for b in result.removed]
@@ -133,8 +135,15 @@ def _summary(result: "Refinement", verdict: str) -> list[str]:
         f"counts           {', '.join(f'{word} {n}' for word, n in sums.items() if n)}",
         f"sigma0           {result.sigma0:.4f} (robust {result.robust_sigma0:.4f})   redundancy "
         f"{redundancy}, {inspection.steps} steps",
-        f"chi2 test        {describe_test(result.global_test(), UNIT_OF_WEIGHT)}",
+        f"chi2 test        {describe_global_test(result)}",
     ]
+
+
+def describe_global_test(result: "Refinement") -> str:
+    """The conclusion of the χ² test; a terrain model that does not fit is its first cause."""
+    fit = result.terrain_fit
+    cause = "the terrain model does not fit" if fit is not None and fit.is_contradicted else ""
+    return describe_test(result.global_test(), UNIT_OF_WEIGHT, further_cause=cause)
 
 
 def _fits(result: "Refinement", used_points: list[dict]) -> Iterator[str]:
@@ -164,6 +173,16 @@ def _unknowns(result: "Refinement") -> Iterator[str]:
             f"  {str(name):46s} {value * name.factor:13.5f} {s * name.factor:11.5f} {prior:>10s} "
             f"{name.unit}"
         )
+
+
+def _heights_beside_image_points(result: "Refinement") -> list[dict]:
+    """The terrain heights used as rows of image points, whose second coordinate is missing."""
+    return [
+        {"image": "terrain (m)", "point": row["point"]}
+        | {name: np.array([row[name], np.nan]) for name in ("v", "r", "w")}
+        for row in result.terrain_heights()
+        if not row["removed"]
+    ]
 
 
 def _tests(rows: list[dict], number: int) -> Iterator[str]:

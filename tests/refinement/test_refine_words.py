@@ -21,8 +21,14 @@ from jaxbundle.refinement import inspection, local_points, weakness
 from jaxbundle.refinement.correction_tables import columns_of_photographs
 from jaxbundle.refinement.freedom import UnknownName
 from jaxbundle.refinement.kinds import control
-from jaxbundle.refinement.refining import _beyond_priors, east_north_up
+from jaxbundle.refinement.refining import (
+    Refinement,
+    _beyond_priors,
+    _contradicted_terrain,
+    east_north_up,
+)
 from jaxbundle.refinement.tables import check_observations, has_upright_checks
+from jaxbundle.refinement.terrain_heights import HeightModel
 
 
 def geographic_points():
@@ -122,6 +128,23 @@ def test_given_positions_of_photographs_are_priors(sigma, said):
     )  # fmt: skip
     assert column.sigma == (np.inf if np.isnan(sigma) else sigma)
     assert bool(list(_beyond_priors(result, 0.001))) == said
+
+
+@pytest.mark.parametrize("v, sigma0, said", [
+    ([6.0, -2.0] * 8, 1.5, True), ([6.0, -2.0] * 8, 4.0, False), ([1.0, -2.0] * 8, 0.9, False),
+])  # fmt: skip
+def test_a_terrain_model_that_fits_worse_than_all_else_is_named(v, sigma0, said):
+    """√(vᵀPv/Σr) of its heights, which is σ0 of these alone."""
+    rows = [{"v": x, "r": 0.8, "removed": False} for x in v]
+    rows += [{"v": 99.0, "r": np.nan, "removed": True}]
+    inputs = SimpleNamespace(terrain=HeightModel(None, 2.0, "dem.tif"))
+    result = SimpleNamespace(terrain_heights=lambda: rows, inputs=inputs, sigma0=sigma0)
+    result.terrain_fit = fit = Refinement.terrain_fit.func(result)
+    assert fit.ratio == pytest.approx(np.sqrt(np.mean(np.square(v)) / 0.8) / 2)
+    warnings = list(_contradicted_terrain(result))
+    assert bool(warnings) == fit.is_contradicted == said
+    assert all("dem.tif does not fit: residuals of 16 heights are 2.5 times" in w and
+               "on average 2 m above it" in w for w in warnings)  # fmt: skip
 
 
 @pytest.mark.parametrize("image, hinted", [([0, 1, 1], False), ([0, 0, 1], True)])

@@ -16,6 +16,7 @@ from jaxbundle.pushbroom.rpc.bias import RpcBias, project_compensated
 from jaxbundle.pushbroom.rpc.polynomials import project_points
 from jaxbundle.pushbroom.terrain import make_terrain
 from jaxbundle.refinement import HeightModel, point_rows, prior_of_bias, prior_of_errors, refine
+from jaxbundle.report.refinement_verdict import conclude_refinement
 
 
 @pytest.fixture(scope="module")
@@ -180,6 +181,21 @@ def test_terrain_heights_are_observations(scene):
     up = lambda result: result.inspection.point_sigma[on_plane, 2].mean() / result.sigma0
     assert up(found) < 0.5 < up(without)
     assert (np.abs(found.estimate - bias.ravel()) < 3.5 * found.inspection.sigma).all()
+    assert conclude_refinement(found).findings[1][:2] == ("Terrain", "met")
+    assert not any("dem.tif does not fit" in w for w in found.warnings)
+    # another surface, 50 m, ten σ, higher and lower by turns: more than images take up
+    hilly = np.asarray(terrain.heights) + 50.0 * np.where(np.arange(50) // 5 % 2, 1, -1)
+    wrong = dataclasses.replace(terrain, heights=jnp.asarray(hilly))
+    unfit = refine(images, points, observations, terrain=HeightModel(wrong, 5.0, "dem.tif"))
+    assert any(w.startswith(f"dem.tif does not fit: residuals of {ties} heights") for w in
+               unfit.warnings)  # fmt: skip
+    verdict = conclude_refinement(unfit)
+    assert verdict.findings[1][:2] == ("Terrain", "not met")
+    assert "heights of the terrain" in verdict.words
+    report = unfit.report()
+    assert "; the terrain model does not fit, the a priori σ" in report
+    of_tests = report[report.index("Image points and terrain heights with the largest tests") :]
+    assert "terrain (m)" in of_tests
     # a building: the terrain is 15 m too low at one point
     tie = int(np.flatnonzero(np.array(scene.roles) == "tie")[4])
     cells = np.asarray(terrain.heights).copy()

@@ -25,7 +25,7 @@ def is_tested(redundancy: int, origin: str) -> bool:
     return redundancy > 0 and origin == STATED
 
 
-def contradicts(scale: float, redundancy: int) -> bool:
+def contradicts(scale: float, redundancy: float) -> bool:
     """Whether a scale of 1 can be excluded."""
     low, high = (
         math.sqrt(chi2_quantile(p, redundancy) / redundancy)
@@ -49,10 +49,15 @@ def chi_squared_test(
 
 
 def describe_test(
-    test: dict, unit: str, significance: float = LEVEL, shared_errors: bool = False
+    test: dict,
+    unit: str,
+    significance: float = LEVEL,
+    shared_errors: bool = False,
+    further_cause: str = "",
 ) -> str:
     """The conclusion of a `chi_squared_test`, or why there is none; `unit`: of weight, such as
-    "1 mm"; `shared_errors`: whether an error model found errors that residuals hardly show."""
+    "1 mm"; `shared_errors`: whether an error model found errors that residuals hardly show;
+    `further_cause` of large residuals, which is named first."""
     if test["low"] is None:
         return "no redundancy: σ0 and standard deviations cannot be estimated"
     if test["sigma_origin"] == ESTIMATED:
@@ -70,7 +75,5 @@ def describe_test(
         return f"{beginning}the a priori σ are confirmed"
     if test["vtpv"] < test["low"]:
         return f"{beginning}the observations are better than their a priori σ"
-    return (
-        f"{beginning}the a priori σ are too small, blunders are left, or the cameras lack "
-        "parameters"
-    )
+    causes = "the a priori σ are too small, blunders are left, or the cameras lack parameters"
+    return f"{beginning}{f'{further_cause}, ' if further_cause else ''}{causes}"
