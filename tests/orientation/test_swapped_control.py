@@ -1,10 +1,14 @@
 """Which names of points are exchanged, from two lists of them in different frames."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import jaxbundle
+from jaxbundle import Camera
+from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.tables import Points
 from jaxbundle.orientation import alignment, batched
 from jaxbundle.orientation.alignment import similarity, similarity_of_most
@@ -165,3 +169,33 @@ def test_a_model_is_moved_by_the_best_that_is_known_of_its_frame(monkeypatch, kn
     )  # fmt: skip
     network = SimpleNamespace(points=points, images=images)
     assert alignment.move_to_given_frame(network, None, model) == expected
+
+
+@pytest.mark.parametrize("seed, pair", [(1, (1, 2)), (5, (1, 2)), (2, (1, 3))])
+def test_two_exchanged_points_of_five_are_named_whatever_images_they_orient(seed, pair):
+    """Images that the wrong points orient fit them in part: the points are judged without them."""
+    targets = np.random.default_rng(seed).uniform([-2, -2, -0.6], [2, 2, 0.6], (14, 3))
+    camera = Camera("cam", "opencv", {"fx": 3200.0, "fy": 3200.0, "cx": 1999.5, "cy": 1499.5})
+    start = dataclasses.replace(camera, parameters=camera.parameters | {"fx": 3150.0, "fy": 3150.0})
+    network = jaxbundle.simulate(
+        jaxbundle.ring_of_stations(6, 4.0, 6.0, roll_every=2), targets, camera, noise=0.3, start=start,
+        control=range(5), control_sigma=0.002, datum="control", image_format=(4000, 3000),
+    )  # fmt: skip
+    images, points = network.images, network.points
+    position, order = points.position.copy(), list(range(5))
+    i, j = pair
+    order[i], order[j] = j, i
+    position[:5] = position[order]
+    position[5:] = np.nan
+    unknown = np.full_like(images.position, np.nan)
+    exchanged = network.replace(
+        images=dataclasses.replace(images, position=unknown, angles=unknown),
+        points=dataclasses.replace(points, position=position),
+    )
+    try:
+        said = jaxbundle.orient(exchanged).finding
+    except NotSolvedError as error:
+        said = str(error)
+    assert f"{points.id[i]!r} and {points.id[j]!r} are exchanged" in said or (
+        f"{points.id[j]!r} and {points.id[i]!r} are exchanged" in said
+    )
