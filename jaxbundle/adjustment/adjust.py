@@ -259,7 +259,7 @@ def _orient(network: Network, mirror: Callable[[float | None], str]) -> Oriented
     """Start values of most of a network; an error also names mirrored control if that might explain
     it."""
     try:
-        return require_most_oriented(orient(network))
+        return require_most_oriented(network, orient(network))
     except NotSolvedError as error:
         if CONTRADICTORY_CONTROL in str(error) and (mirrored := mirror(None)):
             # The images decide which: of points in a plane both may fit the tolerance.
@@ -290,7 +290,9 @@ def _try_mirrored(
     reduction: str | None, options: Mapping[str, Any], network: Network
 ) -> float | None:
     """σ0 of a network from computed start values; None without a solution."""
-    first_minimum = FirstMinimum(reduction, (), require_most_oriented(orient(network)), options)
+    first_minimum = FirstMinimum(
+        reduction, (), require_most_oriented(network, orient(network)), options
+    )
     minimum = first_minimum.find(network, outliers=False)
     return sigma0_at_end(minimum.problem, minimum.minimum) if minimum.is_solved else None
 

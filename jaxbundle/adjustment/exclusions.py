@@ -292,8 +292,8 @@ def readmit(
     )
     network = keep_points(keep_images(network, model.placed), is_known & ~line)
     reason = "that the adjusted orientation does not determine either"
-    network = note_missing(network, "image", missing_images, reason)
-    network = note_missing(network, "point", missing_points, reason)
+    network = note_missing(network, network_as_given, "image", missing_images, reason)
+    network = note_missing(network, network_as_given, "point", missing_points, reason)
     for note in _notes(network_as_given, agreeing, line, one_place, np.zeros(len(images), bool)):
         network = record_left_out(network, note.thing, note.names, note.why)
     rays = network_as_given.observations

@@ -38,6 +38,7 @@ from jaxbundle.leastsquares.problem import with_data, with_factor
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.equation_counts import name_undetermined_points
 from jaxbundle.network.kinds.figures import KNOWN_SHAPES, sigma_across_rays
 from jaxbundle.network.subsets import split_check_points
 from jaxbundle.network.tables import Network, Observations, Points
@@ -266,16 +267,23 @@ class FirstMinimum:
         )
 
 
-def require_most_oriented(oriented: Oriented) -> Oriented:
-    """The start values unchanged; refused if they exclude half or more of the images or points.
+def require_most_oriented(network_as_given: Network, oriented: Oriented) -> Oriented:
+    """The start values of a network unchanged; refused if they exclude half or more of the images,
+    or of the points that start values can make determinable.
 
     **Raises:** `NotSolvedError`."""
     network = oriented.network
+    # Tie points of a single photograph say nothing about its orientation: they are left out of any
+    # network. Without other points they are why nothing can be solved.
+    undetermined = name_undetermined_points(network_as_given) if len(network.points) else ()
+    missing_points = {
+        id: why for id, why in oriented.points_not_placed.items() if id not in undetermined
+    }
     # A half that is placed may be the wrong half: with so little, what is excluded says more about
     # the network than what is left.
     for thing, reasons, remaining in (
         ("image", oriented.images_not_placed, len(network.images)),
-        ("point", oriented.points_not_placed, len(network.points)),
+        ("point", missing_points, len(network.points)),
     ):
         if len(reasons) >= remaining:
             reasons_in_words = list_some(

@@ -6,7 +6,7 @@ network each need their own datum.
 """
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, list_some
@@ -17,6 +17,8 @@ from jaxbundle.network.tables import (
     Network,
     Points,
 )
+
+EQUATIONS_OF_A_POINT = 3  # one for each coordinate
 
 
 def count_controlled_axes(points: Points) -> Int[np.ndarray, " points"]:
@@ -36,6 +38,32 @@ def equations_of(network: Network, object_type: str) -> Int[np.ndarray, " things
     return number
 
 
+def _count_measurements(
+    network: Network,
+    points_kept: Bool[np.ndarray, " points"],
+    images_kept: Bool[np.ndarray, " images"],
+) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, " points"]]:
+    """The rays of every point from the images kept, and its distances to points kept."""
+    rays, distances = network.observations, network.distances
+    ends = distances.points[points_kept[distances.points].all(1)]
+    return (
+        np.bincount(rays.point[images_kept[rays.image]], minlength=len(points_kept)),
+        np.bincount(ends.ravel(), minlength=len(points_kept)),
+    )
+
+
+def name_undetermined_points(network: Network) -> frozenset[str]:
+    """Ids of the points that no start value would make determinable: they have fewer than three
+    equations even if every image and every other point is used."""
+    points, images = network.points, network.images
+    rays, distance_counts = _count_measurements(
+        network, np.ones(len(points), bool), np.ones(len(images), bool)
+    )
+    equations = 2 * rays + distance_counts
+    equations += count_controlled_axes(points) + equations_of(network, "POINTS")
+    return frozenset(points.id[row] for row in np.flatnonzero(equations < EQUATIONS_OF_A_POINT))
+
+
 def leave_out_with_too_few_rays(network: Network) -> Network:
     """The network without points with too few rays and images with too few points, with notes
     that list them.
@@ -51,10 +79,9 @@ def leave_out_with_too_few_rays(network: Network) -> Network:
     # image other points lose a ray. Everything is counted again until nothing changes.
     first_error = None
     while True:
-        rays = np.bincount(point[images_kept[image]], minlength=len(points))
-        ends = distances.points[points_kept[distances.points].all(1)]
-        distance_counts = np.bincount(ends.ravel(), minlength=len(points))
-        determined = is_fixed | (2 * rays + distance_counts + point_equations >= 3)
+        rays, distance_counts = _count_measurements(network, points_kept, images_kept)
+        equations = 2 * rays + distance_counts + point_equations
+        determined = is_fixed | (equations >= EQUATIONS_OF_A_POINT)
         # Fixed points that no image sees add nothing, nor do images without points, whatever is
         # known of them.
         next_points_kept = points_kept & np.where(

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.equation_counts import name_undetermined_points
 from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.orientation.incremental import (
     Model,
@@ -14,17 +15,23 @@ from jaxbundle.orientation.rays import Sights
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
 
-def note_missing(network: Network, noun: str, reasons: Mapping[str, str], clause: str) -> Network:
-    """The network with notes that images or points were left out, by name with the reasons."""
+def note_missing(
+    network: Network, given: Network, noun: str, reasons: Mapping[str, str], clause: str
+) -> Network:
+    """The network with notes that images or points of the one `given` were left out, by name with
+    the reasons."""
     if not reasons:
         return network
+    undetermined = name_undetermined_points(given) if noun == "point" else frozenset()
     names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
-    groups = {
-        why: tuple(id for id, reason in reasons.items() if reason == why)
-        for why in dict.fromkeys(reasons.values())
-    }
+    groups: dict[tuple[str, bool], list[str]] = {}
+    for id, why in reasons.items():
+        groups.setdefault((why, id not in undetermined), []).append(id)
     network = network.note(f"left out {count(len(reasons), noun)} {clause}: {names}")
-    notes = (LeftOut(noun, ids, f"{clause}: {why}") for why, ids in groups.items())
+    notes = (
+        LeftOut(noun, tuple(ids), f"{clause}: {why}", measured)
+        for (why, measured), ids in groups.items()
+    )
     return network.replace(left_out=(*network.left_out, *notes))
 
 

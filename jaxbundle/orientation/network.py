@@ -415,7 +415,7 @@ def _result(
     keep = model.placed
     has_coordinates = np.all(np.isfinite(X), axis=1)
     reasons = explain_missing(network, sights, model, has_coordinates, settings)
-    rays = network.observations
+    given, rays = network, network.observations
     network = network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),
@@ -424,7 +424,9 @@ def _result(
     network = keep_points(keep_images(network, keep), has_coordinates)
     network = network.note(f"start values found, {frame}")
     for noun, reason_by_id in zip(("image", "point"), reasons):
-        network = note_missing(network, noun, reason_by_id, "for which no start values were found")
+        network = note_missing(
+            network, given, noun, reason_by_id, "for which no start values were found"
+        )
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in gross_rows)
     network = record_left_out(network, "image point", names, CONTRADICTION)
     return Oriented(network, frame, *reasons, names)

@@ -317,6 +317,25 @@ def test_an_example_needs_no_start_values():
     assert_same_answer(network, bare(network))
 
 
+def test_details_of_a_single_photograph_are_left_out_by_name():
+    """As many tie points as control, all measured once: no start values would determine them."""
+    control = jaxbundle.read_network(EXAMPLES / "resection63" / "project.toml")
+    names = control.points.id[4:]
+    roles = lambda ties: (*control.points.role[:-ties], *("tie",) * ties)
+    as_ties = lambda ties: control.replace(
+        points=dataclasses.replace(control.points, role=roles(ties))
+    )
+    found = adjust(bare(as_ties(len(names))))
+    started = adjust(as_ties(len(names)))
+    assert found.redundancy == 2 and found.vtpv == pytest.approx(started.vtpv, rel=1e-9)
+    for result in (found, started):
+        (note,) = result.problem.network.left_out
+        assert note.names == names and not note.measured
+    # Where there are no others, they are why nothing can be solved.
+    with pytest.raises(NotSolvedError, match="no start values for 8 of 8 points"):
+        adjust(bare(as_ties(8), images=False))
+
+
 @pytest.mark.skipif(not CASES.is_dir(), reason="the folder ../shared/cases is not here")
 def test_a_case_needs_no_start_values():
     network = jaxbundle.read_network(CASES / "riva_3dfield" / "project.toml")
