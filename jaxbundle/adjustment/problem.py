@@ -17,7 +17,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.any_distance import derivative
-from jaxbundle.leastsquares.datum.defect import CannotHold
+from jaxbundle.leastsquares.datum.defect import MAX_OPEN_EFFECT, CannotHold
 from jaxbundle.leastsquares.declarations import ObservationSet, Table
 from jaxbundle.leastsquares.indexing.rows import Data, Values
 from jaxbundle.network.camera_tables import CameraTable
@@ -26,8 +26,9 @@ from jaxbundle.network.declare import DeclaredNetwork, declare, order_cameras
 from jaxbundle.network.kinds.base import included_tables
 from jaxbundle.network.kinds.image_points import image_coordinates
 from jaxbundle.network.retraction import TurnAboutSeen, control_is_weak
+from jaxbundle.network.rules import AXES
 from jaxbundle.network.subsets import split_check_points
-from jaxbundle.network.tables import Network, are_among, require_network
+from jaxbundle.network.tables import Network, Points, are_among, require_network
 from jaxbundle.types import AnyArray, not_none
 
 NEGLIGIBLE_MOTION = 1e-6
@@ -330,6 +331,20 @@ def _datum_points(network: Network) -> Bool[np.ndarray, " points"]:
     return carries_datum if carries_datum.any() else points.has_role("control")
 
 
+def _overpowering_control(points: Points) -> str:
+    """A sentence where the σ of one coordinate is so small that others count as none."""
+    sigma = np.where(points.has_role("control")[:, None], points.sigma, np.inf)
+    largest = sigma.max(initial=0.0, where=np.isfinite(sigma))
+    if not largest * MAX_OPEN_EFFECT > sigma.min(initial=np.inf):
+        return ""
+    row, axis = np.unravel_index(sigma.argmin(), sigma.shape)
+    return (
+        f"{points.source(row)}: σ of {AXES[axis]} of control point {points.id[row]!r} is "
+        f"{sigma[row, axis]:g}: beside it others, of up to {largest:g}, have no effect; make it "
+        "larger, or leave all three σ of the point empty to hold it. "
+    )
+
+
 def _datum(
     network: Network,
     gauge: Float[np.ndarray, "7 defect"],
@@ -343,8 +358,8 @@ def _datum(
         words = open_directions_in_words(gauge, about.mean(0) if len(about) else np.zeros(3))
         raise InputError(
             f"the datum is not fixed: the observations leave open {words}"
-            f" ({gauge.shape[1]} of 7). Give control points or distances, or choose datum = "
-            '"inner" or "minimal".'
+            f" ({gauge.shape[1]} of 7). {_overpowering_control(points)}Give control points or "
+            'distances, or choose datum = "inner" or "minimal".'
         )
     # With the scale open, all distances shrink to fit a σ that is a length (1 mm from a plane): the
     # minimum would be a network of size 0.

@@ -19,7 +19,11 @@ from jaxbundle.network.equation_counts import (
     check_redundancy,
     leave_out_with_too_few_rays,
 )
-from jaxbundle.network.number_range import check_coordinates
+from jaxbundle.network.number_range import (
+    check_coordinates,
+    is_usable_sigma,
+    sigma_requirement,
+)
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.rules import (
     AXES,
@@ -182,10 +186,11 @@ def _check_images(network: Network) -> None:
     )
     _refuse(
         images,
-        (sigma < 0) | np.isinf(sigma),
+        ~(np.isnan(sigma) | (sigma == 0) | is_usable_sigma(sigma)),
         "image",
         lambda row, k: (
-            f"σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be positive and finite, "
+            f"σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be "
+            f"{sigma_requirement(sigma[row, k], 'positive and finite')}, "
             'empty (no prior), or "fixed" (0) to hold the value'
         ),
     )
@@ -237,11 +242,12 @@ def _check_points(network: Network) -> Network:
     )
     _refuse(
         points,
-        control[:, None] & (sigma <= 0),
+        control[:, None] & ~(np.isnan(sigma) | np.isposinf(sigma) | is_usable_sigma(sigma)),
         "control point",
         lambda row, k: (
-            f"σ of {AXES[k]} is {sigma[row, k]:g}; it must be positive; leave all "
-            'three σ empty to hold the point, write "free" for an axis that is not controlled'
+            f"σ of {AXES[k]} is {sigma[row, k]:g}; it must be {sigma_requirement(sigma[row, k])}; "
+            'leave all three σ empty to hold the point, write "free" for an axis that is not '
+            "controlled"
         ),
     )
     _refuse(
@@ -282,13 +288,14 @@ def _check_observations(network: Network) -> None:
             f"{observations.xy[row, k]}; expected a finite number"
         )
     sigma = observations.sigma
-    for row, k in np.argwhere(~(np.isfinite(sigma) & (sigma > 0)))[:1]:
+    last_digit = np.finfo(float).eps * np.abs(observations.xy).max()
+    for row, k in np.argwhere(~is_usable_sigma(sigma) & ~((0 < sigma) & (sigma < last_digit)))[:1]:
         raise InputError(
             f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
-            f"{sigma[row, k]:g}; it must be finite and positive: correct it, or leave it empty to "
-            "use sigma_image"
+            f"{sigma[row, k]:g}; it must be "
+            f"{sigma_requirement(sigma[row, k], 'finite and positive')}: correct it, or leave it "
+            "empty to use sigma_image"
         )
-    last_digit = np.finfo(float).eps * np.abs(observations.xy).max()
     for row, k in np.argwhere(sigma < last_digit)[:1]:
         raise InputError(
             f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
@@ -316,10 +323,11 @@ def _check_distances(network: Network) -> Network:
         )
     for name in ("value", "sigma"):
         column = getattr(distances, name)
-        for row in np.flatnonzero(~(np.isfinite(column) & (column > 0)))[:1]:
+        # A length has the range of a coordinate, which is that of a σ.
+        for row in np.flatnonzero(~is_usable_sigma(column))[:1]:
             raise InputError(
                 f"{distances.source(row)}: distance {names[row]}: {name} is {column[row]:g}; it "
-                "must be finite and positive"
+                f"must be {sigma_requirement(float(column[row]), 'finite and positive')}"
             )
     for row in np.flatnonzero(points.has_role("check")[distances.points].any(1))[:1]:
         raise InputError(

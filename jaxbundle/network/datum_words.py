@@ -16,7 +16,9 @@ def open_directions_in_words(
     """Which of shift, rotation and scale the observations leave open, for messages.
 
     Rotation and scale are about the point `centre`: with one point known, no shift is open."""
+    # Of unit size, largest element first: squares of very large or small motions are no numbers.
     gauge = np.array(gauge)
+    gauge /= np.abs(gauge).max(axis=0)
     gauge[:3] += np.cross(gauge[3:6].T, centre).T + np.outer(centre, gauge[6])
     q, _ = np.linalg.qr(gauge / np.linalg.norm(gauge, axis=0)) if gauge.size else (gauge, None)
     # The norm of a row is the part of that motion in the open ones, from 0 to 1: what belongs to

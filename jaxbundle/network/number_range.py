@@ -1,13 +1,40 @@
-"""Coordinates that 64-bit numbers can hold, with the digits that a network needs."""
+"""Coordinates and σ that 64-bit numbers can hold, with the digits that a network needs."""
+
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
+from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Network
 
-# Normal equations and cofactors have products of four lengths, and sums over many of them: a
-# hundredth of the fourth root of the largest number.
+# Normal equations and cofactors have products of four lengths, or of two lengths and the weight
+# 1/σ², and sums over many of them: a hundredth of the fourth root of the largest number.
 LARGEST = float(f"{np.finfo(float).max ** (1 / 4) / 100:.0e}")
+
+
+def is_usable_sigma(sigma: Float[np.ndarray, " *shape"] | float) -> Bool[np.ndarray, " *shape"]:
+    """Which σ can be computed with, by their squares and those of their weights; infinite and
+    missing ones cannot."""
+    sigma = np.asarray(sigma)
+    return (sigma >= 1 / LARGEST) & (sigma <= LARGEST)
+
+
+def sigma_requirement(sigma: float, positive: str = "positive") -> str:
+    """What a σ that cannot be used must be, in words; `positive`: where it is no positive
+    number."""
+    return f"between {1 / LARGEST:g} and {LARGEST:g}" if 0 < sigma < np.inf else positive
+
+
+def sigma_of_setting(name: str, value: Any) -> float:
+    """A σ that a setting gives.
+
+    **Raises:** `InputError` for one that cannot be used."""
+    sigma = positive(name, value)
+    if not is_usable_sigma(sigma):
+        raise InputError(f"{name} is {sigma:g}; it must be {sigma_requirement(sigma)}")
+    return sigma
 
 
 def check_coordinates(

@@ -20,6 +20,7 @@ from jaxbundle.cameras import (
 )
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.number_range import is_usable_sigma, sigma_requirement
 from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, Camera, Source
 from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 
@@ -113,8 +114,7 @@ def check_camera(camera: Camera, where: str = "") -> None:
                 f"{where}sigma is given for {name!r}, which is not free; add it to free, or remove "
                 f"its sigma (free: {', '.join(camera.free) or 'none'})"
             )
-        if not _is_positive(sigma):
-            raise InputError(f"{where}sigma of {name} is {sigma}; it must be finite and positive")
+        _check_sigma(f"{where}sigma of {name}", sigma)
     for name, value in camera.observed.items():
         if name not in camera.sigma:
             raise InputError(
@@ -184,8 +184,15 @@ def check_sigma_image(sigma: float, where: str = "") -> None:
     """Refuse a default σ of image coordinates that is not finite and positive."""
     if isinstance(sigma, bool) or not isinstance(sigma, int | float | np.number):
         raise InputError(f"{where}sigma_image is {show(sigma)}; expected a number")
+    _check_sigma(f"{where}sigma_image", sigma)
+
+
+def _check_sigma(name: str, sigma: Any) -> None:
+    """Refuse a σ that cannot be computed with."""
     if not _is_positive(sigma):
-        raise InputError(f"{where}sigma_image is {show(sigma)}; it must be finite and positive")
+        raise InputError(f"{name} is {show(sigma)}; it must be finite and positive")
+    if not is_usable_sigma(sigma):
+        raise InputError(f"{name} is {show(sigma)}; it must be {sigma_requirement(sigma)}")
 
 
 def _is_positive(value: Any) -> bool:

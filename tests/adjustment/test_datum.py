@@ -142,7 +142,15 @@ def test_words():
     assert open_directions_in_words(gauge("a distance")).endswith("rotation Z")
     assert open_directions_in_words(np.zeros((7, 0))) == "none"
     together = np.array([[0, 0, 1, 0, 0, 0, 1.0]]).T
-    assert open_directions_in_words(together) == "1 combination of shift Z, scale"
+    for size in (1.0, 1e-300, 1e200):  # squares that are no numbers
+        assert open_directions_in_words(size * together) == "1 combination of shift Z, scale"
+
+
+def test_a_sigma_beside_which_others_count_as_none_is_named():
+    """Three control points fix a datum; not if one coordinate is a hundred billion times better."""
+    control = with_control(FREE, [[1e-11 * S, S, S], [S, S, S], [S, S, S]]).replace(datum="control")
+    with pytest.raises(InputError, match="σ of X of control point 'P0' is 1e-13: beside it others"):
+        make_problem(control)
 
 
 def test_an_open_datum_is_refused_unless_asked_for():

@@ -83,6 +83,7 @@ def test_jacobians():
     (("cam", "fx/fy/cx", 1.0, 1.0), "expected a parameter or a ratio of two, such as fy/fx"),
     (("cam", "k2", 0.0, 1.0), "k2 of camera 'cam' cannot change: expected k2 to be free"),
     (("cam", "fx", 900.0, -1.0), "sigma is -1; it must be positive"),
+    (("cam", "fx", 900.0, 1e200), r"sigma is 1e\+200; it must be between 1e-75"),
 ])  # fmt: skip
 def test_what_cannot_be_observed_is_refused(row, message):
     with pytest.raises(InputError, match=message):

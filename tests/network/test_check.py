@@ -86,6 +86,13 @@ SIGMA = {"sX": 0.1, "sY": 0.1, "sZ": 0.1}
     ("points", 2, {"role": "controll"}, ["points, row 3", "'p2'", "role", "tie, control, fixed"]),
     ("points", 2, {"role": "check", "Y": None}, ["points, row 3", "'p2'", "Y is missing"]),
     ("points", 2, {**CONTROL, **SIGMA, "sY": 0.0}, ["points, row 3", "'p2'", "σ of Y", "positive"]),
+    ("points", 2, {**CONTROL, **SIGMA, "sX": 1e-300},
+     ["points, row 3", "'p2'", "σ of X is 1e-300", "between 1e-75 and 1e+75", "empty to hold"]),
+    ("points", 2, {**CONTROL, **SIGMA, "sY": 1e308}, ["σ of Y is 1e+308", "between", '"free"']),
+    ("images", 0, {"sX0": 1e-76}, ["images, row 1", "'i0'", "σ of X0 is 1e-76", "between"]),
+    ("observations", 9, {"sx": 1e76}, ["observations, row 10", "1e+76", "between 1e-75"]),
+    ("distances", 0, {"sigma": 1e-200}, ["distances, row 1", "sigma is 1e-200", "between"]),
+    ("distances", 0, {"value": 1e200}, ["distances, row 1", "value is 1e+200", "between"]),
     ("points", 2, {**CONTROL, **SIGMA, "sZ": None}, ["row 3", "'p2'", "σ of Z", "free"]),
     ("observations", 9, {"sy": -3.1},
      ["observations, row 10", "σ of y", "'p1'", "'i1'", "-3.1", "finite and positive"]),
@@ -128,6 +135,7 @@ def test_the_other_images_without_a_start_value_are_counted(missing, more):
     (Camera("cam", "brown", {"c": 1.0}, ("r0",)), ["'cam'", "r0", "cannot be estimated"]),
     (Camera("cam", "brown", {"c": 1.0}, (), {"c": 1.0}), ["'cam'", "'c'", "not free"]),
     (Camera("cam", "brown", {"c": 1.0}, ("c",), {"c": 0.0}), ["'cam'", "sigma of c", "positive"]),
+    (Camera("cam", "brown", {"c": 1.0}, ("c",), {"c": 1e-90}), ["sigma of c is 1e-90", "between"]),
     (Camera("cam", "brown", {"c": 1.0}, image_size=(0, 5)), ["'cam'", "image_size", "positive"]),
 ])  # fmt: skip
 def test_a_bad_camera_is_refused(camera, said):

@@ -182,6 +182,7 @@ def test_a_sigma_of_the_difference_lets_it_move():
     (rows("c") | {"other": ["left"]}, "expected two different cameras"),
     (rows("x0"), "x0 is free in neither 'left' nor 'right'"),
     (rows("c", sigma=[-1.0]), "sigma is -1; it must be positive"),
+    (rows("c", sigma=[1e-200]), "sigma is 1e-200; it must be between 1e-75"),
 ])  # fmt: skip
 def test_ties_that_cannot_be_are_refused(table, message):
     with pytest.raises(InputError, match=message):

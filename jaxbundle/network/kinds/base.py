@@ -8,10 +8,15 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbundle.arguments import positive, show
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.network.columns import Columns, did_you_mean, refuse_unknown
+from jaxbundle.network.number_range import (
+    is_usable_sigma,
+    sigma_of_setting,
+    sigma_requirement,
+)
 from jaxbundle.network.tables import Images, Network, Points, Rows, Source, row_indices
 
 # Unknowns of further tables that are lengths, in the object unit.
@@ -233,11 +238,29 @@ def positive_sigma(
 ) -> Float[np.ndarray, " rows"]:
     """A column of σ; NaN if missing.
 
-    **Raises:** `InputError` for one that is not positive, or is missing but required."""
+    **Raises:** `InputError` for one that cannot be used, or is missing but required."""
     sigma = table.numbers(name, required=required)
-    for row in np.flatnonzero(~(sigma > 0) & ~np.isnan(sigma))[:1]:
-        raise InputError(f"{table.source(row)}: {name} is {sigma[row]:g}; it must be positive")
+    refuse_unusable(table, name, sigma)
     return sigma
+
+
+def sigma_or_exact(table: Columns) -> Float[np.ndarray, " rows"]:
+    """σ of distances; 0 if exact or missing.
+
+    **Raises:** `InputError` for one that cannot be used."""
+    sigma = table.numbers("sigma", words={"exact": 0.0})
+    refuse_unusable(table, "sigma", np.where(sigma == 0, np.nan, sigma))
+    return np.where(np.isnan(sigma), 0.0, sigma)
+
+
+def refuse_unusable(table: Columns, name: str, sigma: Float[np.ndarray, " rows"]) -> None:
+    """Refuse the first σ of a column that cannot be computed with; NaN and infinite: none."""
+    is_none = np.isnan(sigma) | np.isposinf(sigma)
+    for row in np.flatnonzero(~(is_none | is_usable_sigma(sigma)))[:1]:
+        raise InputError(
+            f"{table.source(row)}: {name} is {sigma[row]:g}; it must be "
+            f"{sigma_requirement(float(sigma[row]))}"
+        )
 
 
 def check_settings(section: str, settings: Mapping[str, Any], known_names: Sequence[str]) -> None:
@@ -303,7 +326,7 @@ class Parameters:
         for name, value in sigma.items():
             if name not in free:
                 raise InputError(f"[{section}]: sigma is given for {name!r}, which is not free")
-            positive(f"[{section}]: sigma of {name}", value)
+            sigma_of_setting(f"[{section}]: sigma of {name}", value)
         return Parameters(names, tuple(free), dict(sigma))
 
     def mask(self, names: Sequence[str]) -> Bool[np.ndarray, "1 n"]:

@@ -36,7 +36,13 @@ from jaxbundle.leastsquares.datum.motions import move_pose, scale_length
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Frame, Posed, PoseValue, Triple
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, ObservationTable, positive_sigma, rows_of
+from jaxbundle.network.kinds.base import (
+    Contribution,
+    ObservationTable,
+    positive_sigma,
+    rows_of,
+    sigma_or_exact,
+)
 from jaxbundle.network.kinds.fit_figures import FEWEST, TYPES, fit
 from jaxbundle.network.tables import Network
 from jaxbundle.types import Scalar
@@ -328,11 +334,3 @@ def sigma_across_rays(network: Network) -> float:
     ray_vectors = network.points.position[rays.point] - images.position[rays.image]
     c = np.array(shortest)[images.camera[rays.image]]
     return float(np.median(np.linalg.norm(ray_vectors, axis=1) * rays.sigma.min(1) / c))
-
-
-def sigma_or_exact(table: Columns):
-    """σ of distances; 0 if exact."""
-    sigma = table.numbers("sigma", words={"exact": 0.0})
-    for row in np.flatnonzero(sigma < 0)[:1]:
-        raise InputError(f"{table.source(row)}: sigma is {sigma[row]:g}; it must be positive")
-    return np.nan_to_num(sigma)

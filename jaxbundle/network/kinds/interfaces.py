@@ -41,7 +41,12 @@ from jaxbundle.leastsquares.datum.motions import move_pose, scale_length, scale_
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
 from jaxbundle.leastsquares.spaces import Change, Frame, Posed, PoseValue, Triple, Vector
 from jaxbundle.network.columns import Columns, did_you_mean, is_missing
-from jaxbundle.network.kinds.base import Contribution, ObservationTable, computed_minus_given
+from jaxbundle.network.kinds.base import (
+    Contribution,
+    ObservationTable,
+    computed_minus_given,
+    refuse_unusable,
+)
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 
@@ -119,16 +124,16 @@ class Interfaces(ObservationTable):
         unit = np.where([name in TILT for name in COLUMNS], radians, 1.0)
         value = np.stack([table.numbers(name) for name in COLUMNS], 1) * unit
         words = {"free": np.inf}
-        sigma = np.stack([table.numbers(name, words=words) for name in sigmas], 1) * unit
-        for row, k in np.argwhere(sigma <= 0)[:1]:
-            raise InputError(f"{table.source(row)}: {sigmas[k]} is not positive; expected a σ")
+        sigma = np.stack([table.numbers(name, words=words) for name in sigmas], 1)
+        for name, column in zip(sigmas, sigma.T):
+            refuse_unusable(table, name, column)
         cells = table.values.get("camera", [None] * len(table))
         interfaces = cls(
             interface=table.ids("interface"),
             type=table.ids("type"),
             camera=tuple("" if is_missing(cell) else str(cell).strip() for cell in cells),
             value=value,
-            sigma=sigma,
+            sigma=sigma * unit,
             source=table.source,
         )
         for row in range(len(interfaces)):

@@ -21,12 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.arguments import positive, show
+from jaxbundle.arguments import show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet
 from jaxbundle.leastsquares.spaces import Posed
 from jaxbundle.network.kinds.base import POSE_UNITS, check_settings, numbers
+from jaxbundle.network.number_range import is_usable_sigma, sigma_of_setting, sigma_requirement
 
 MOUNTING = "mounting"
 AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
@@ -140,10 +141,11 @@ def _sigmas(section: str, key: str, setting: Any) -> Float[np.ndarray, "3"]:
     except (TypeError, ValueError):
         sigma = np.zeros(3)
     # NaN is not positive either
-    if not (sigma > 0).all():
+    unusable = sigma[~(is_usable_sigma(sigma) | np.isposinf(sigma))]
+    if len(unusable):
         raise InputError(
-            f"[{section}]: {key} is {show(setting)}; expected a positive number, or three (inf: "
-            "nothing is known of an axis)"
+            f"[{section}]: {key} is {show(setting)}; expected a number, or three, "
+            f"{sigma_requirement(unusable[0])} (inf: nothing is known of an axis)"
         )
     return sigma
 
@@ -193,7 +195,9 @@ def read_bases(section: str, settings: Any) -> tuple[Base, ...]:
         if not pair or not all(isinstance(c, str) for c in cameras) or cameras[0] == cameras[1]:
             raise InputError(f"[{where}]: cameras is {show(cameras)}; expected two names")
         length, sigma = (
-            positive(f"[{where}]: {key}", base.get(key, np.nan)) for key in ("length", "sigma")
+            # A length has the range of a coordinate, which is that of a σ.
+            sigma_of_setting(f"[{where}]: {key}", base.get(key, np.nan))
+            for key in ("length", "sigma")
         )
         bases.append(Base((cameras[0], cameras[1]), length, sigma))
     return tuple(bases)

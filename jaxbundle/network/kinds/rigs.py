@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
@@ -42,6 +41,7 @@ from jaxbundle.network.kinds.mountings import (
     read_mountings,
     turn_of,
 )
+from jaxbundle.network.number_range import sigma_of_setting
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
@@ -120,7 +120,7 @@ class Rigs(ObservationTable):
         check_settings(SECTION, settings, KEYS)
         for name in ("sigma_position", "sigma_angle"):
             if name in settings:
-                positive(f"[{SECTION}]: {name}", settings[name])
+                sigma_of_setting(f"[{SECTION}]: {name}", settings[name])
         read_mountings(SECTION, settings.get("mounting", {}), radians)
         read_bases(SECTION, settings.get("bases", ()))
         return cls(

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxbundle.arguments import one_of, positive
+from jaxbundle.arguments import one_of
 from jaxbundle.choices import HAND_EYE
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.quaternions import (
@@ -56,6 +56,7 @@ from jaxbundle.network.kinds.mountings import (
     mounting_minus_given,
     read_mountings,
 )
+from jaxbundle.network.number_range import sigma_of_setting
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
@@ -412,7 +413,7 @@ def _precision(
     for k, key in enumerate(("sigma_position", "sigma_angle")):
         part = sigma[:, 3 * k : 3 * k + 3]
         if key in settings:
-            part[np.isnan(part)] = positive(f"[{SECTION}]: {key}", settings[key])
+            part[np.isnan(part)] = sigma_of_setting(f"[{SECTION}]: {key}", settings[key])
         for row in np.flatnonzero(np.isnan(part).any(1))[:1]:
             raise InputError(
                 f"{table.source(row)}: the σ of the {key[6:].replace('angle', 'attitude')} of the "

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxbundle.arguments import number, positive, show
+from jaxbundle.arguments import number, show
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_rotation_vector, rotation_vector_from_matrix
 from jaxbundle.leastsquares.declarations import Kind, ObservationSet, Table
@@ -45,6 +45,7 @@ from jaxbundle.network.kinds.base import (
     positive_sigma,
     rows_of,
 )
+from jaxbundle.network.number_range import sigma_of_setting
 from jaxbundle.network.rules import check_unique
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import to_image_unit
@@ -213,7 +214,7 @@ def _check_neighbours(neighbours: Any, table: Columns) -> None:
             f"turns, {{ v = 0.5, w = 0.02 }}"
         )
     for name, value in neighbours.items():
-        positive(f"[{SECTION}]: neighbours, σ of {name}", value)
+        sigma_of_setting(f"[{SECTION}]: neighbours, σ of {name}", value)
     for row in np.flatnonzero(np.isnan(table.numbers("t")))[:1]:
         if neighbours:
             raise InputError(

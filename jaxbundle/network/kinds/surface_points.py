@@ -36,8 +36,9 @@ from jaxbundle.network.kinds.base import (
     check_settings,
     numbers,
     rows_of,
+    sigma_or_exact,
 )
-from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_across_rays, sigma_or_exact
+from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_across_rays
 from jaxbundle.network.surface_models import have_common_point, surface_near
 from jaxbundle.network.tables import Network
 

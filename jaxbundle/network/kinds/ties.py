@@ -21,8 +21,8 @@ from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.spaces import Change
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.kinds.base import Contribution, ObservationTable
-from jaxbundle.network.kinds.figures import EXACT_SIGMA, sigma_or_exact
+from jaxbundle.network.kinds.base import Contribution, ObservationTable, sigma_or_exact
+from jaxbundle.network.kinds.figures import EXACT_SIGMA
 from jaxbundle.network.tables import Network
 from jaxbundle.system.programs import compile_once
 from jaxbundle.types import AnyArray, Scalar
