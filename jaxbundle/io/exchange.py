@@ -20,7 +20,7 @@ from jaxbundle.io.formats import FORMATS, check_own_models, read_network, recogn
 from jaxbundle.io.networks.assemble import network_of_cameras
 from jaxbundle.io.networks.bundler import LIST
 from jaxbundle.io.networks.jaicov import COMPANION_SUFFIXES
-from jaxbundle.io.networks.losses import describe_losses, losing
+from jaxbundle.io.networks.losses import describe_losses, describe_missing_values, losing
 from jaxbundle.io.networks.project import FILE_NAME
 from jaxbundle.io.output_formats import CAMERA_KINDS, TARGETS, has_model, recognise_target
 from jaxbundle.io.results.coordinates import images_path
@@ -174,6 +174,8 @@ def _convert_network(
     tell: Callable[[Sequence[str]], None],
 ) -> Converted:
     network, conversions = _convert_models(network, kind, model, measured)
+    if TARGETS[kind].empty_cells:
+        network = network.warn(*describe_missing_values(network))
     folder, files = _output_folder(output, kind), TARGETS[kind].files
     format_losses = (*describe_losses(network, TARGETS[kind].losses), *unread)
     tell(format_losses)

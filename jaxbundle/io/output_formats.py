@@ -67,8 +67,9 @@ class OutputFormat:
     `write` returns messages about what is not kept: `losses`, and what only the writer sees; no
     `models`: all, a name with * is a family.
     `files`: names of the files in a folder; none: a file is written. `alone`: cameras
-    without images can be written. `parts`: the files or folders that are written of a network, if
-    there may be several.
+    without images can be written. `empty_cells`: images and points without values are written as
+    empty cells, which nothing computes later. `parts`: the files or folders that are written of a
+    network, if there may be several.
     """
 
     recognises: Callable[[Path], bool]
@@ -77,6 +78,7 @@ class OutputFormat:
     models: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
     alone: bool = False
+    empty_cells: bool = False
     losses: Losses = dataclasses.field(default_factory=dict)
     parts: Callable[[Network, Path], tuple[Path, ...]] | None = None
 
@@ -162,6 +164,7 @@ TARGETS: dict[str, OutputFormat] = {
         _has_suffix(".csv"),
         write_coordinates,
         "NAME.csv",
+        empty_cells=True,
         losses=COORDINATES_LOSSES,
     ),
     "bundler": OutputFormat(

@@ -2,6 +2,7 @@
 they keep comes back to rounding."""
 
 import csv
+import dataclasses
 import struct
 
 import conversions
@@ -209,6 +210,26 @@ def test_the_command_tells_it(command, tmp_path):
     assert "image" in again.err and "points (12)" in again.err
     quiet = command("convert", tmp_path / "given", tmp_path / "n.ply", "--quiet")
     assert quiet.err == quiet.out == ""
+
+
+def test_a_table_of_unknowns_is_told_to_be_one(command, tmp_path):
+    """A project keeps start values empty on purpose."""
+    from jaxbundle.io import write_project
+
+    given = full_network("opencv")
+    angles, position = given.images.angles.copy(), given.points.position.copy()
+    angles[0], position[given.points.has_role("tie")] = np.nan, np.nan
+    number = given.points.has_role("tie").sum()
+    given = given.replace(
+        images=dataclasses.replace(given.images, angles=angles),
+        points=dataclasses.replace(given.points, position=position),
+    )
+    write_project(given, tmp_path / "given")
+    done = command("convert", tmp_path / "given", tmp_path / "n.csv")
+    without = f"1 image without orientation, {number} points without coordinates: "
+    assert f"warning: {without}their cells are empty; convert the result of" in done.err
+    copied = command("convert", tmp_path / "given", tmp_path / "copy")
+    assert "without" not in copied.err + copied.out
 
 
 @pytest.mark.parametrize("kind", CAMERA_KINDS)

@@ -10,11 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.network.columns import count
 from jaxbundle.network.kinds import KINDS
-from jaxbundle.network.tables import UNIT, Camera, Network
+from jaxbundle.network.tables import UNIT, Camera, Images, Network, Points
 from jaxbundle.network.units import METRES
 
 # Camera models common to formats of computer vision.
@@ -33,18 +35,40 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
                 f"camera {camera.id!r}: {format} has no model {str(camera.model)!r}; convert it "
                 f"with --model {model}"
             )
-    images, object_points = network.images, network.points
-    tables = [
-        (images, images.position, "image", "orientation"),
-        (images, images.angles, "image", "orientation"),
-        (object_points, object_points.position, "point", "coordinates"),
-    ]
-    for table, values, name, quantity in tables[: 3 if points else 2]:
-        for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
+    for table, missing, name, quantity in _rows_without_values(network)[: 2 if points else 1]:
+        for row in missing[:1]:
             raise InputError(
                 f"{table.source(row)}: {name} {table.id[row]!r} has no {quantity} to be written: "
-                "convert the result of jaxbundle orient or adjust, which compute what is missing"
+                f"{GET_VALUES}"
             )
+
+
+def describe_missing_values(network: Network) -> tuple[str, ...]:
+    """What a table of a network has empty cells for, in one sentence; none if there is nothing."""
+    parts = [
+        f"{count(len(missing), name)} without {quantity}"
+        for _, missing, name, quantity in _rows_without_values(network)
+        if len(missing)
+    ]
+    return (f"{', '.join(parts)}: their cells are empty; {GET_VALUES}",) if parts else ()
+
+
+GET_VALUES = "convert the result of jaxbundle orient or adjust, which compute what is missing"
+
+
+def _rows_without_values(
+    network: Network,
+) -> list[tuple[Images | Points, Int[np.ndarray, " missing"], str, str]]:
+    """Images and points with the rows that lack values, and what is lacking in words."""
+    images, points = network.images, network.points
+    tables = (
+        (images, np.concatenate([images.position, images.angles], 1), "image", "orientation"),
+        (points, points.position, "point", "coordinates"),
+    )
+    return [
+        (table, np.flatnonzero(~np.isfinite(values).all(1)), name, quantity)
+        for table, values, name, quantity in tables
+    ]
 
 
 # Formats whose lengths are metres, with the names of their programs.
