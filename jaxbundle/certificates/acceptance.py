@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,12 @@ from jaxbundle.certificates.lengths import LengthTest, length_errors, read_lengt
 from jaxbundle.certificates.quantities import find_quantity, named_unknown, offered
 from jaxbundle.certificates.quantities_of_batches import SOLVED
 from jaxbundle.certificates.quantities_of_others import unknown_quantity
-from jaxbundle.certificates.quantity import AXES, require_parameter
+from jaxbundle.certificates.quantity import (
+    AXES,
+    require_parameter,
+    require_rig_camera,
+    rig_camera_and_name,
+)
 from jaxbundle.certificates.units import convert, kind_of
 from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import InputError, NotSolvedError
@@ -270,11 +275,12 @@ def check_criteria(
     command: str,
     network: Network | None = None,
     models: Sequence[str] = (),
+    camera_names: Collection[str] = (),
 ) -> list[Criterion]:
     """Refuse criteria that cannot be decided, before the result is there.
 
-    **Arguments:** `command` whose result it will be; its `network`, or the camera `models`, where
-    they are known.
+    **Arguments:** `command` whose result it will be; its `network`, or the camera `models` and, of
+    a rig, the `camera_names`, where they are known.
 
     **Raises:** `InputError` naming the criterion, and what is known."""
     criteria, known_quantities = read_criteria(texts or ()), offered(command)
@@ -290,6 +296,8 @@ def check_criteria(
             if criterion.name in OF_UNKNOWNS and command != "pushbroom refine":
                 _check_unknown(criterion, cameras, network, command)
             known_quantities[criterion.name].check_argument(criterion.argument)
+            if command == "calibrate-rig" and camera_names:
+                _check_rig_camera(criterion, camera_names)
             _check_unit(criterion, known_quantities[criterion.name].unit, network)
         except InputError as error:
             raise InputError(f"--accept {criterion.text!r}: {error}") from None
@@ -325,6 +333,15 @@ def _check_unknown(
         name in (*c.free, *c.unknowns) for c in chosen_cameras
     ):
         raise InputError(f"{name} is held, and not estimated: add it to free")
+
+
+def _check_rig_camera(criterion: Criterion, known_cameras: Collection[str]) -> None:
+    """Refuse the name of a camera that the rig does not have."""
+    if criterion.name in OF_UNKNOWNS:
+        camera, _ = rig_camera_and_name(criterion.argument)
+    else:  # the only argument of another quantity is a camera
+        camera = criterion.argument or "*"
+    require_rig_camera(camera, known_cameras)
 
 
 def _check_unit(criterion: Criterion, words: str, network: Network | None) -> None:

@@ -34,10 +34,11 @@ from jaxbundle.certificates.quantity import (
     number_of_result,
     one_value,
     require_parameter,
+    require_rig_camera,
+    rig_camera_and_name,
 )
 from jaxbundle.certificates.units import NO_PITCH, PixelPitch
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.reconstruction.result import Reconstruction
 from jaxbundle.refinement import Refinement
@@ -430,9 +431,9 @@ OF_CALIBRATION: tuple[Quantity, ...] = (
 
 def _rig_rms(subject: Subject, argument: str) -> QuantityValues:
     rig: RigCalibration = subject.result
-    if argument and argument not in rig.rms:
-        raise InputError(f"there is no camera {argument!r}{did_you_mean(argument, rig.rms)}")
-    rms_of_cameras = {f"camera {n}": v for n, v in rig.rms.items() if argument in ("", n)}
+    camera = argument or "*"
+    require_rig_camera(camera, rig.rms)
+    rms_of_cameras = {f"camera {n}": v for n, v in rig.rms.items() if camera in ("*", n)}
     return QuantityValues(rms_of_cameras, "px", _pitch([rig.camera(n) for n in rig.names]))
 
 
@@ -440,12 +441,8 @@ def _rig_sigma(subject: Subject, argument: str) -> QuantityValues:
     rig: RigCalibration = subject.result
     if argument in ("base", "rotation"):
         return _mountings(rig, argument)
-    camera, mark, name = argument.partition(":")
-    camera, name = (camera, name) if mark else ("*", argument)
-    if camera == "camera" and ":" in name:
-        camera, _, name = name.rpartition(":")
-    if camera not in ("*", *rig.names):
-        raise InputError(f"there is no camera {camera!r}{did_you_mean(camera, rig.names)}")
+    camera, name = rig_camera_and_name(argument)
+    require_rig_camera(camera, rig.names)
     cameras = {n: rig.camera(n) for n in rig.names if camera in ("*", n)}
     values = {f"{name} of camera {n}": rig.sigma[n][name] for n in cameras if name in rig.sigma[n]}
     if not values:

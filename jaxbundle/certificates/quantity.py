@@ -1,7 +1,7 @@
 """What a quantity is that acceptance criteria may name."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from jaxbundle.cameras import get_model
@@ -84,6 +84,24 @@ def number_of_result(function: Callable[[Any], float]) -> Callable[[Subject, str
         return one_value(function(subject.result))
 
     return find
+
+
+def rig_camera_and_name(argument: str) -> tuple[str, str]:
+    """Camera (* for all) and parameter of a σ of a rig: NAME, CAMERA:NAME or camera:CAMERA:NAME."""
+    camera, mark, name = argument.partition(":")
+    if not mark:
+        return "*", argument
+    if camera == "camera" and ":" in name:
+        camera, _, name = name.rpartition(":")
+    return camera, name
+
+
+def require_rig_camera(camera: str, known_cameras: Collection[str]) -> None:
+    """Refuse the name of a camera that a rig does not have; * are all.
+
+    **Raises:** `InputError`."""
+    if camera not in ("*", *known_cameras):
+        raise InputError(f"there is no camera {camera!r}{did_you_mean(camera, known_cameras)}")
 
 
 def require_parameter(cameras: Any, name: str) -> None:

@@ -86,6 +86,7 @@ class CalibrationOutputs:
             self.out,
             self.photographs,
             models=self.models,
+            camera_names=self.names,
             force=self.force,
         )
 

@@ -144,6 +144,7 @@ def make_judge(
     *,
     network: Network | None = None,
     models: Sequence[str] = (),
+    camera_names: Sequence[str] = (),
     force: bool = False,
 ) -> Judge:
     """The judge of a command's result, with everything that can be checked before it is there.
@@ -151,7 +152,7 @@ def make_judge(
     **Arguments:** `outputs`: the files of its other options, by option; `inputs`: its files.
 
     **Raises:** `InputError`."""
-    check_criteria(options.accept, command, network, models)
+    check_criteria(options.accept, command, network, models, camera_names)
     details = read_details(options.details)
     known_lengths = None if options.lengths is None else read_lengths(options.lengths)
     if known_lengths is not None and network is not None:

@@ -165,6 +165,13 @@ def test_criteria_are_checked_before_the_work():
         check_criteria(["sigma(c) < 1 um"], "calibrate", models=["opencv"])
     good = ["sigma(base) < 1 mm", "sigma(rotation) < 1 arcsec"]
     check_criteria(good, "calibrate-rig", models=["opencv"])
+    known = {"models": ["opencv"], "camera_names": ["left", "right"]}
+    good += ["rms < 1 px", "rms(left) < 1 px", "sigma(fx) < 1 px", "sigma(*:fx) < 1 px"]
+    good += ["sigma(left:fx) < 1 px", "sigma(camera:right:fx) < 1 px", "sigma0 < 2"]
+    check_criteria(good, "calibrate-rig", **known)
+    for text in ("rms(lefd) < 1 px", "sigma(lefd:fx) < 1 px", "sigma(camera:lefd:fx) < 1 px"):
+        with pytest.raises(InputError, match="no camera 'lefd'; did you mean 'left'"):
+            check_criteria([text], "calibrate-rig", **known)
 
 
 def test_every_quantity_that_is_offered_is_documented():
