@@ -1,13 +1,15 @@
 """A digital surface model of a cloud: heights on a grid with the σ of every cell.
 
-A cell has the weighted mean of the heights of its points, p = 1/σ_Z², without those that differ
-from their median by more than three times its spread. Errors of neighbours are highly correlated,
+A cell has the height of the surface at its centre: the weighted mean of the heights of its points,
+p = 1/σ_Z², without those that differ from their median by more than three times its spread, moved
+along the slope s (`cell_slopes.py`) from their centroid, which is d beside the centre: z = z̄ − s·d,
+and the variance of s adds dᵀ·C·d to that of the mean. Errors of neighbours are highly correlated,
 since the windows of their matching overlap: points of a base image that are within a × b pixels of
 it count as m = (1 + a/w)·(1 + b/w) independent ones, w the side of the windows, at most as the n
-that they are. With the scatter of the points, σ² = max(n/m, χ²/(n − 1))/Σp. Small gaps are filled
-with the mean of the heights around, weighted by the inverse squares of their distances, with σ from
-the cells around and the distance to them; beside a wall from the lower surface, since hidden parts
-are low (Hirschmüller 2008).
+that they are. With the scatter of the points about their slope, σ² = max(n/m, χ²/(n − 1))/Σp.
+Small gaps are filled with the mean of the heights around, weighted by the inverse squares of their
+distances, with σ from the cells around and the distance to them; beside a wall from the lower
+surface, since hidden parts are low (Hirschmüller 2008).
 
 The errors of the orientations are common to the points of a cell, and no mean reduces them: weights
 are by the σ without them, and their mean variance is added to that of the cell.
@@ -27,6 +29,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.vertical import horizontal_system
 from jaxbundle.io.rasters.writing import write_raster
 from jaxbundle.leastsquares.quality.distributions import NORMAL_SIGMA_BY_MAD
+from jaxbundle.surfaces.cell_slopes import CellMeans, cell_slopes
 from jaxbundle.surfaces.cloud import Cloud
 
 if TYPE_CHECKING:
@@ -49,12 +52,18 @@ class DsmSettings:
     """Least σ for `max_deviation`, in cell sizes: on a slope of 45° the heights of a cell have a
     standard deviation of 1/√12 of its size, and are all good."""
     slope: float = 0.3
-    """σ of a filled cell, in cell sizes for each cell of distance: the slope of the surface that is
-    not known in a gap, 17°. To be larger for steep terrain; no measurement stands behind it."""
+    """σ of the slope of the surface where it is not known, 17°: in a gap, whose cells have this in
+    cell sizes for each cell of distance, and before it is measured. To be larger for steep terrain;
+    no measurement stands behind it."""
+    step: float = 4.28
+    """Ratio of variance factors of two planes above which the worse one has a step: the 95 %
+    quantile of F(6, 6), of nine cells each less three unknowns. Larger: slopes lean over low steps;
+    smaller: those of one side are taken on smooth ground, where it is curved."""
     wall: float = 1.0
-    """Standard deviation of the heights around a gap, in cell sizes, above which they are of two
-    surfaces: that of a wall is half its height. Larger: higher walls are filled with means;
-    smaller: steep slopes are filled from below."""
+    """Standard deviation of the heights around a gap, or of 3 × 3 cells, in cell sizes, above which
+    they are of two surfaces: that of a wall is half its height, of 3 × 3 cells on a slope 0.8 of
+    it. Larger: gaps beside higher walls are filled with means, and cells there may lean; smaller:
+    steep slopes are filled from below, and count as not known."""
     window: float = 5.0
     """Side of the windows of matching, pixels: of dense matching the smallest, which pixels of good
     texture take."""
@@ -128,21 +137,19 @@ def make_dsm(
             f"a DSM of {rows} × {columns} cells of {size:g} is too large; give larger cells"
         )
     cell = ((row - top) * columns + (column - left)).astype(np.int64)
-    Z, sigma_Z, number = cloud.X[:, 2], cloud.sigma[:, 2], rows * columns
+    # Of the points from the centres of their cells.
+    x, y = cloud.X[:, 0] - (column + 0.5) * size, cloud.X[:, 1] + (row + 0.5) * size
+    Z, sigma_Z = cloud.X[:, 2], cloud.sigma[:, 2]
     if cloud.shared is not None:
         sigma_Z = np.sqrt(np.maximum(sigma_Z**2 - cloud.shared, 0.0))
     points_as_one = _points_that_count_as_one(cloud, cell, settings.window)
-    height, sigma, count = _average_cells(cell, Z, sigma_Z, size, number, points_as_one, settings)
-    shape = rows, columns
-    model = Dsm(
-        height.reshape(shape),
-        sigma.reshape(shape),
-        count.reshape(shape),
-        float(left * size),
-        float(-top * size),
-        size,
-        cloud.system,
-    )
+    height, sigma = np.full((2, rows, columns), np.nan)
+    count = np.zeros((rows, columns), int)
+    X = np.stack([x, y, Z])
+    cells, *values = _average_cells(cell, X, sigma_Z, columns, size, points_as_one, settings)
+    for grid, value in zip((height, sigma, count), values):
+        grid.flat[cells] = value
+    model = Dsm(height, sigma, count, float(left * size), float(-top * size), size, cloud.system)
     if fill:
         model = _fill(model, fill, settings)
     return model if cloud.shared is None else _add_shared(model, cell, cloud.shared)
@@ -216,17 +223,20 @@ def _points_that_count_as_one(
 
 def _average_cells(
     cell: Int[np.ndarray, " n"],
-    Z: Float[np.ndarray, " n"],
+    X: Float[np.ndarray, "3 n"],
     sigma: Float[np.ndarray, " n"],
+    columns: int,
     size: float,
-    number: int,
     points_as_one: Float[np.ndarray, " cells"],
     settings: DsmSettings,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted means by cell, their σ and numbers of points; `points_as_one`: for each cell
-    with points, how many of them count as one."""
-    order = np.lexsort((Z, cell))
-    cell, Z, sigma = cell[order], Z[order], sigma[order]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cells with points in ascending order, heights at their centres, σ of these, numbers of
+    points.
+
+    **Arguments:** `X`: points, x and y from the centre of their cell; `sigma` of their heights;
+    `points_as_one`: for each cell with points, how many of them count as one."""
+    order = np.lexsort((X[2], cell))
+    cell, (x, y, Z), sigma = cell[order], X[:, order], sigma[order]
     cells, begin, count = np.unique(cell, return_index=True, return_counts=True)
     group = np.repeat(np.arange(len(cells)), count)
     middle = _sorted_medians(Z, begin, count)
@@ -243,15 +253,17 @@ def _average_cells(
         np.where(is_known, weight, np.median(weight[is_known]) if is_known.any() else 1.0) * keep
     )
     total = np.bincount(group, weight)
-    mean = np.bincount(group, weight * Z) / total
+    d_x, d_y, mean = (np.bincount(group, weight * a) / total for a in (x, y, Z))
+    d = np.stack([d_x, d_y])
+    means = CellMeans(cells, columns, size, mean, d, total / points_as_one)
+    slope, covariance = cell_slopes(means, settings.slope, settings.step, settings.wall)
+    height = mean - np.sum(slope * d, 0)
+    residual = Z - height[group] - slope[0, group] * x - slope[1, group] * y
     n = np.bincount(group, keep)
-    square = np.bincount(group, weight * (Z - mean[group]) ** 2)
+    square = np.bincount(group, weight * residual**2)
     ratio = np.maximum(points_as_one, square / np.maximum(n - 1, 1))
-    out = np.full((2, number), np.nan)
-    out[0, cells], out[1, cells] = mean, np.sqrt(ratio / total) if is_known.any() else np.nan
-    numbers = np.zeros(number, int)
-    numbers[cells] = n
-    return out[0], out[1], numbers
+    variance = ratio / total + np.einsum("ik,ijk,jk->k", d, covariance, d)
+    return cells, height, np.sqrt(variance) if is_known.any() else np.full(len(cells), np.nan), n
 
 
 def _sorted_medians(

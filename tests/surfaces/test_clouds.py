@@ -15,13 +15,24 @@ from jaxbundle import plotting
 from jaxbundle.errors import InputError
 from jaxbundle.planning.texture import Texture
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points, to_plane
+from jaxbundle.surfaces.cell_slopes import WINDOW, CellMeans, _neighbours
 from jaxbundle.surfaces.cloud import Cloud, empty_cloud, merge
 from jaxbundle.surfaces.cloud_filters import drop_isolated, drop_weak, thin
 from jaxbundle.surfaces.compare import compare
-from jaxbundle.surfaces.dsm import NO_DATA, Dsm, make_dsm, write_dsm
+from jaxbundle.surfaces.dsm import (
+    NO_DATA,
+    Dsm,
+    DsmSettings,
+    make_dsm,
+    write_dsm,
+)
 from jaxbundle.surfaces.files import text_of
 from jaxbundle.surfaces.orthophoto import orthophoto, write_orthophoto
 from jaxbundle.surfaces.point_files import COLOURS, _read_las, read_cloud, write_cloud
+
+
+def on_plane(x, y):
+    return 0.2 * (x - 500_000) - 0.1 * (y - 5_000_000) + 30
 
 
 def cloud_on_plane(n=4000, noise=0.05, seed=0, system=None):
@@ -29,7 +40,7 @@ def cloud_on_plane(n=4000, noise=0.05, seed=0, system=None):
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0, 40, (n, 2)) + [500_000, 5_000_000]
     sigma = np.column_stack([np.full((n, 2), noise / 5), noise * (1 + np.arange(n) % 2)])
-    Z = 0.2 * (xy[:, 0] - 500_000) - 0.1 * (xy[:, 1] - 5_000_000) + 30
+    Z = on_plane(*xy.T)
     X = np.column_stack([xy, Z + sigma[:, 2] * rng.standard_normal(n)])
     C = np.eye(3) * sigma[:, :, None] ** 2
     colour = rng.integers(0, 256, (n, 3)).astype(np.uint8)
@@ -64,8 +75,9 @@ def test_a_point_of_no_sigma_has_the_weight_of_the_worst():
 
 def test_errors_of_orientations_are_not_averaged_in_a_cell():
     """Nine independent points of σ 0.3 and one error of 0.4 common to them: 0.1² + 0.4²."""
-    rng = np.random.default_rng(1)
-    X = np.column_stack([rng.uniform(0, 1, (9, 2)), np.full(9, 5.0)])
+    v, u = np.indices((3, 3)).reshape(2, -1)
+    # evenly about the centre of the cell: its slope, which is not known, has no effect
+    X = np.stack([(u + 0.5) / 3, (v + 0.5) / 3, np.full(9, 5.0)], 1)
     C = np.broadcast_to(np.diag([0.1, 0.1, 0.25]), (9, 3, 3))
     uv = 100.0 * np.arange(18).reshape(9, 2)
     cloud = Cloud(X, C, np.full(9, 2), np.zeros(9, int), uv, ("a",), shared=np.full(9, 0.16))
@@ -73,7 +85,6 @@ def test_errors_of_orientations_are_not_averaged_in_a_cell():
     np.testing.assert_allclose(dsm.own_sigma, 0.1)
     np.testing.assert_allclose(dsm.sigma, np.hypot(0.1, 0.4))
     # points whose windows overlap count as one: m = (1 + 2/5)·(1 + 2/5) of the nine
-    v, u = np.indices((3, 3)).reshape(2, -1)
     near = dataclasses.replace(cloud, uv=np.stack([u, v], 1).astype(float), shared=None)
     np.testing.assert_allclose(make_dsm(near, 1.0).sigma, 0.5 / 1.4)
     assert make_dsm(near, 1.0).own_sigma is None
@@ -212,16 +223,14 @@ def test_a_drawing_of_too_many_points_is_refused(tmp_path, monkeypatch):
 
 def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
     dsm = make_dsm(plane, 2.0)
-    x, y = dsm.centres()
     assert dsm.height.shape == (20, 20)
-    # the points of a cell are not spread evenly about its middle
-    truth = 0.2 * (x - 500_000) - 0.1 * (y - 5_000_000) + 30
-    assert np.sqrt(np.mean((dsm.height - truth) ** 2)) < 0.1
-    level = plane.X[:, 2] - (0.2 * (plane.X[:, 0] - 500_000) - 0.1 * (plane.X[:, 1] - 5_000_000))
-    X = np.column_stack([plane.X[:, :2], level])
-    model = make_dsm(dataclasses.replace(plane, X=X), 2.0)
-    w = (model.height - 30) / model.sigma
-    assert 0.8 < np.sqrt(np.mean(w**2)) < 1.2
+    # The points of a cell are not spread evenly about its middle, least where they are few.
+    one_base = dataclasses.replace(plane, image=0 * plane.image)
+    for n, size in ((4000, 2.0), (1200, 2.0), (4000, 1.0)):
+        model = make_dsm(one_base.take(np.arange(n)), size, fill=0)
+        x, y = model.centres()
+        w = (model.height - on_plane(x, y)) / model.sigma
+        assert 0.8 < np.sqrt(np.nanmean(w**2)) < 1.2
     path = tmp_path / "dsm.tif"
     write_dsm(dsm, path, tmp_path / "sigma.tif")
     with rasterio.open(path) as raster:
@@ -232,6 +241,93 @@ def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
         assert raster.descriptions == ("height",)
     with rasterio.open(tmp_path / "sigma.tif") as raster:
         assert raster.descriptions == ("sigma of height",)
+
+
+def points_of(surface, n=1200, side=12, seed=3):
+    """Points of a surface at random places, without errors; σ 0.01."""
+    xy = np.random.default_rng(seed).uniform(0, side, (n, 2))
+    C = np.broadcast_to(1e-4 * np.eye(3), (n, 3, 3))
+    X = np.column_stack([xy, surface(*xy.T)])
+    return Cloud(X, C, np.full(n, 2), np.zeros(n, int), np.full((n, 2), np.nan), ("a",))
+
+
+def test_heights_are_those_of_the_centres_of_cells():
+    """Of a plane exactly: in cells of one point, beside gaps and at the edge."""
+    surface = lambda x, y: 7 + 0.6 * x - 0.4 * y
+    for n in (150, 1200):
+        cloud = points_of(surface, n)
+        near_gap = np.abs(cloud.X[:, :2] - 5.0).max(1)
+        cloud = cloud.take(near_gap > 1.5)
+        dsm = make_dsm(cloud, 1.0, fill=0, settings=DsmSettings(slope=1e3))
+        has_slope = np.isfinite(dsm.height) & (dsm.sigma < 1)
+        assert has_slope.sum() > 0.6 * np.isfinite(dsm.height).sum()
+        assert (dsm.count[has_slope] == 1).sum() > 0.3 * has_slope.sum() or n == 1200
+        expected = surface(*dsm.centres())[has_slope]
+        np.testing.assert_allclose(dsm.height[has_slope], expected, atol=1e-5)
+
+
+def test_no_height_leans_over_a_step():
+    """Cells beside it have the slope of their own side."""
+    surface = lambda x, y: 0.1 * x - 0.2 * y + np.where(x > 6, 3.0, 0.0)
+    dsm = make_dsm(points_of(surface), 1.0)
+    np.testing.assert_allclose(dsm.height, surface(*dsm.centres()), atol=1e-3)
+    # Of a ridge one cell wide no plane is known; its own points are level.
+    ridge = make_dsm(points_of(lambda x, y: 3.0 * (np.floor(x) == 6)), 1.0)
+    np.testing.assert_allclose(ridge.height[:, 6], 3.0, atol=0.2)
+    np.testing.assert_allclose(np.delete(ridge.height, 6, 1), 0.0, atol=1e-9)
+
+
+def test_a_step_at_a_gap_is_no_slope():
+    """Two columns of cells before a gap, on both sides of a step: no plane can tell."""
+    surface = lambda x, y: np.where(x > 6, 1.0, 0.0)
+    cloud = points_of(surface)
+    x = cloud.X[:, 0]
+    dsm = make_dsm(cloud.take((x > 5) & (x < 7)), 1.0)
+    np.testing.assert_allclose(dsm.height, surface(*dsm.centres()), atol=1e-9)
+
+
+def test_walls_are_no_slopes():
+    """Terraces one cell wide, exactly in a plane, but far steeper than a slope."""
+    surface = lambda x, y: 4.0 * np.floor(x)
+    dsm = make_dsm(points_of(surface), 1.0)
+    np.testing.assert_allclose(dsm.height, surface(*dsm.centres()), atol=1e-9)
+
+
+def test_neighbours_are_cells_with_points_in_the_grid():
+    """Not the last cell of the row above the first one of a row."""
+    number = np.array([0, 2, 3, 4, 5, 7, 8, 11])
+    zero = np.zeros(8)
+    cells = CellMeans(number, 4, 1.0, zero, np.zeros((2, 8)), zero)
+    expected = [
+        [
+            list(number).index(place)
+            if 0 <= column + step[1] < 4
+            and (place := (row + step[0]) * 4 + column + step[1]) in number
+            else 8
+            for row, column in zip(*np.divmod(number, 4))
+        ]
+        for step in WINDOW
+    ]
+    np.testing.assert_array_equal(_neighbours(cells, slice(0, 8)), expected)
+
+
+def test_the_slope_that_is_not_known_is_in_the_sigma_of_a_single_cell():
+    X = np.array([[0.2, 0.9, 5.0]])
+    C = np.full((1, 3, 3), 0.05**2)
+    cloud = Cloud(X, C, np.full(1, 2), np.zeros(1, int), np.zeros((1, 2)), ("a",))
+    dsm = make_dsm(cloud, 1.0, settings=DsmSettings(slope=0.3))
+    assert dsm.height == 5.0
+    np.testing.assert_allclose(dsm.sigma, np.hypot(0.05, 0.3 * np.hypot(0.3, 0.4)))
+
+
+def test_slopes_of_parts_are_those_of_all_cells(monkeypatch):
+    """Windows reach over the borders of the parts that are computed at a time."""
+    cloud = points_of(lambda x, y: np.sin(x) + 0.3 * y)
+    whole = make_dsm(cloud, 1.0)
+    monkeypatch.setattr("jaxbundle.surfaces.cell_slopes.CHUNK", 17)
+    parts = make_dsm(cloud, 1.0)
+    np.testing.assert_array_equal(parts.height, whole.height)
+    np.testing.assert_array_equal(parts.sigma, whole.sigma)
 
 
 def test_a_height_far_from_the_others_of_its_cell_is_left_out():
