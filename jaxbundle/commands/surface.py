@@ -16,7 +16,7 @@ from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.results import TableMethods
 from jaxbundle.surfaces.cloud import Cloud
-from jaxbundle.surfaces.dsm import Dsm, make_dsm
+from jaxbundle.surfaces.dsm import Dsm, DsmSettings, make_dsm
 from jaxbundle.surfaces.files import report_of, text_of
 from jaxbundle.surfaces.height_reference import (
     HeightReference,
@@ -174,7 +174,8 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
         inputs, folder, height_range, pairs, reference, {**options, "progress": progress}, say
     )
     views = choose_views(matched.views, orthophoto_of) if orthophoto or orthophoto_of else []
-    model = None if dsm is None else make_dsm(matched.surface.cloud, dsm)
+    cells = DsmSettings(window=settings.window(dense))
+    model = None if dsm is None else make_dsm(matched.surface.cloud, dsm, settings=cells)
     picture = mosaic(views, model, matched.to_views) if views and model is not None else None
     true_points = matched.check if known_points is None else np.asarray(known_points, float)
     return Surface(matched.surface, model, picture, true_points, matched.heights)

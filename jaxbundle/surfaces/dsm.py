@@ -4,9 +4,12 @@ A cell has the height of the surface at its centre: the weighted mean of the hei
 p = 1/σ_Z², without those that differ from their median by more than three times its spread, moved
 along the slope s (`cell_slopes.py`) from their centroid, which is d beside the centre: z = z̄ − s·d,
 and the variance of s adds dᵀ·C·d to that of the mean. Errors of neighbours are highly correlated,
-since the windows of their matching overlap: points of a base image that are within a × b pixels of
-it count as m = (1 + a/w)·(1 + b/w) independent ones, w the side of the windows, at most as the n
-that they are. With the scatter of the points about their slope, σ² = max(n/m, χ²/(n − 1))/Σp.
+since the windows of their matching overlap, those of several base images as much as those of one,
+since their pairs are of the same images. Points of a base image within a × b pixels count as
+m = m₁(a/w)·m₁(b/w) independent ones, w the side of the windows: those whose mean has the variance
+of that over a × b pixels with the correlation (1 − |Δu|/w)·(1 − |Δv|/w), the common part of two
+windows; at most as the n that they are, and of several base images the most. With the scatter of
+the points about their slope, σ² = max(n/m, χ²/(n − 1))/Σp.
 Small gaps are filled with the mean of the heights around, weighted by the inverse squares of their
 distances, with σ from the cells around and the distance to them; beside a wall from the lower
 surface, since hidden parts are low (Hirschmüller 2008).
@@ -65,8 +68,8 @@ class DsmSettings:
     it. Larger: gaps beside higher walls are filled with means, and cells there may lean; smaller:
     steep slopes are filled from below, and count as not known."""
     window: float = 5.0
-    """Side of the windows of matching, pixels: of dense matching the smallest, which pixels of good
-    texture take."""
+    """Side of the windows of matching, pixels, `SurfaceSettings.window`: that of dense matching by
+    default, since files of clouds do not tell it."""
     max_cells: float = 2e9
     """A grid of more cells is refused: at this limit its three arrays take 48 GB."""
 
@@ -214,11 +217,18 @@ def _points_that_count_as_one(
     uv = np.where(np.expand_dims(is_known, 1), cloud.uv, np.inf)[order]
     with np.errstate(invalid="ignore"):
         reach = np.maximum.reduceat(uv, begin) - np.minimum.reduceat(uv, begin)
-    independent = np.prod(1 + reach / window, axis=1)
+    independent = np.prod(_independent_values(reach / window), axis=1)
     # Without a pixel a point stands for itself.
     independent = np.minimum(np.where(np.isfinite(independent), independent, count), count)
-    of_cell = keys // len(cloud.images)
-    return np.bincount(of_cell, count) / np.bincount(of_cell, independent)
+    _, first = np.unique(keys // len(cloud.images), return_index=True)
+    return np.add.reduceat(count, first) / np.maximum.reduceat(independent, first)
+
+
+def _independent_values(length: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """How many independent values have the variance of the mean over a length of values with the
+    correlation 1 − |distance| up to 1, and none beyond: t over the integral of that correlation."""
+    short, long = np.minimum(length, 1.0), np.maximum(length, 1.0)
+    return np.where(length < 1, 1 / (1 - short / 3), 3 * long**2 / (3 * long - 1))
 
 
 def _average_cells(

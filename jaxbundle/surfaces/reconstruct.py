@@ -47,6 +47,13 @@ class SurfaceSettings:
     those of a base image with its three partners, and two that the next may share. With fewer,
     pyramids are made again."""
 
+    def window(self, dense: bool) -> int:
+        """Side of the windows of matching, pixels: of dense matching the smallest, which pixels of
+        good texture take."""
+        refinement = self.dense.refinement
+        half = min(refinement.half_windows) if dense else self.matching.half_fine_window
+        return 2 * half + 1
+
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceResult:

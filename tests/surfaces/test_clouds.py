@@ -23,6 +23,7 @@ from jaxbundle.surfaces.dsm import (
     NO_DATA,
     Dsm,
     DsmSettings,
+    _independent_values,
     make_dsm,
     write_dsm,
 )
@@ -84,9 +85,12 @@ def test_errors_of_orientations_are_not_averaged_in_a_cell():
     dsm = make_dsm(cloud, 1.0)
     np.testing.assert_allclose(dsm.own_sigma, 0.1)
     np.testing.assert_allclose(dsm.sigma, np.hypot(0.1, 0.4))
-    # points whose windows overlap count as one: m = (1 + 2/5)·(1 + 2/5) of the nine
+    # points whose windows overlap count as one: m = 1/(1 − 2/15)² of the nine
     near = dataclasses.replace(cloud, uv=np.stack([u, v], 1).astype(float), shared=None)
-    np.testing.assert_allclose(make_dsm(near, 1.0).sigma, 0.5 / 1.4)
+    np.testing.assert_allclose(make_dsm(near, 1.0).sigma, 0.5 * 13 / 15)
+    # those of a second base image, matched in the same images, have the same errors again
+    both = merge([near, dataclasses.replace(near, images=("b",))])
+    np.testing.assert_allclose(make_dsm(both, 1.0).sigma, 0.5 * 13 / 15)
     assert make_dsm(near, 1.0).own_sigma is None
     half = cloud.take(np.arange(9) < 4)
     assert len(half.shared) == 4 and merge([half, half]).shared.shape == (8,)
@@ -241,6 +245,14 @@ def test_heights_of_a_dsm_are_as_good_as_its_sigma_says(plane, tmp_path):
         assert raster.descriptions == ("height",)
     with rasterio.open(tmp_path / "sigma.tif") as raster:
         assert raster.descriptions == ("sigma of height",)
+
+
+@pytest.mark.parametrize("length", [0.3, 1.0, 4.0])
+def test_overlapping_windows_count_as_the_variance_of_their_mean_says(length):
+    """The mean of the correlation 1 − |distance| of all pairs of places of a length."""
+    place = (np.arange(2000) + 0.5) / 2000 * length
+    correlation = np.maximum(1 - np.abs(place[:, None] - place), 0)
+    np.testing.assert_allclose(1 / correlation.mean(), _independent_values(length), rtol=1e-3)
 
 
 def points_of(surface, n=1200, side=12, seed=3):

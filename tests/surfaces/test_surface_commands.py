@@ -94,6 +94,20 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command, monkeyp
     assert abs(found["comparison"]["median"]) < 0.05
 
 
+@pytest.mark.parametrize("dense, window", [(False, 13), (True, 5)])
+def test_cells_of_a_model_know_the_windows_of_their_matching(tmp_path, monkeypatch, dense, window):
+    """Of nine points of 3 × 3 pixels 1/(1 − 2/(3·window))² count."""
+    v, u = np.indices((3, 3)).reshape(2, -1)
+    X = np.stack([(u + 0.5) / 3, (v + 0.5) / 3, 0.0 * u], 1)
+    cloud = Cloud(X, np.tile(np.eye(3), (9, 1, 1)), np.full(9, 2), np.zeros(9, int),
+                  np.stack([u, v], 1).astype(float), ("a",))  # fmt: skip
+    matched = SimpleNamespace(surface=SimpleNamespace(cloud=cloud), views=(), to_views=None,
+                              check=np.zeros((0, 3)), heights="")  # fmt: skip
+    monkeypatch.setattr("jaxbundle.commands.surface._match_photographs", lambda *_: matched)
+    found = jaxbundle.surface(tmp_path, dense=dense, dsm=1.0)
+    np.testing.assert_allclose(found.dsm.sigma, 1 - 2 / (3 * window))
+
+
 @pytest.mark.parametrize("options, written", [([], True), (["--no-csv"], False)])
 def test_clouds_are_written_as_text_too(tmp_path, command, monkeypatch, options, written):
     n = 5
