@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.arguments import numeric_array
 from jaxbundle.display import print_in_one_screen
@@ -16,7 +17,7 @@ from jaxbundle.io.results.result_json import without_nan
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.results import TableMethods
 from jaxbundle.surfaces.cloud import Cloud
-from jaxbundle.surfaces.dsm import Dsm, DsmSettings, make_dsm
+from jaxbundle.surfaces.dsm import Dsm, DsmSettings, check_number_of_cells, make_dsm
 from jaxbundle.surfaces.files import report_of, text_of
 from jaxbundle.surfaces.height_reference import (
     HeightReference,
@@ -27,7 +28,7 @@ from jaxbundle.surfaces.height_reference import (
 )
 from jaxbundle.surfaces.inputs import check_points, read_views, tie_points
 from jaxbundle.surfaces.orthophoto import ToViews, mosaic
-from jaxbundle.surfaces.pairs import parse_partners
+from jaxbundle.surfaces.pairs import choose_partners, least_extent, parse_partners
 from jaxbundle.surfaces.point_files import read_cloud
 from jaxbundle.surfaces.reconstruct import (
     SurfaceResult,
@@ -55,12 +56,12 @@ Heights = tuple[float, float]
 
 
 class _Wanted(NamedTuple):
-    """The options --crs, --geoid and --heights; whether a model is made."""
+    """The options --crs, --geoid and --heights; the size of the cells of a model, None: none."""
 
     crs: str | None
     geoid: str | Path | None
     heights: str | None
-    model: bool
+    cells: float | None
 
 
 @print_in_one_screen
@@ -169,7 +170,7 @@ def surface(  # noqa: PLR0913 (public: the options of the command, all but one b
         match = _match_ground_images
     else:
         match = _match_photographs
-    reference = _Wanted(crs, geoid, heights, dsm is not None)
+    reference = _Wanted(crs, geoid, heights, dsm)
     matched = match(
         inputs, folder, height_range, pairs, reference, {**options, "progress": progress}, say
     )
@@ -205,7 +206,7 @@ def _match_photographs(
     if photos is None:
         raise InputError("--photos is missing: the folder of the photographs")
     reference = heights_of_photographs(requested.crs, requested.geoid, requested.heights)
-    if requested.model:
+    if requested.cells is not None:
         check_cells(reference, metres=False)
     views, network, messages = read_views(inputs[0], photos)
     if reference.geoid is not None:
@@ -217,7 +218,9 @@ def _match_photographs(
         heights = heights and computed_heights
     bounds, messages_of_bounds = find_bounds(views, tie_points(network), heights)
     _say_all(messages + messages_of_bounds, say)
-    reconstructed = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
+    partners = _partners(pairs, views) or choose_partners(views, bounds)
+    _check_cells_of(requested.cells, lambda: least_extent(views, bounds, partners))
+    reconstructed = reconstruct_surface(views, bounds, partners, **options)
     cloud = reference.apply(reconstructed.cloud)
     _say_all(reconstructed.messages, say)
     all_messages = (*messages, *messages_of_bounds, *reconstructed.messages)
@@ -241,32 +244,40 @@ def _match_ground_images(
     views, around = read_ground_views(inputs, photos)
     if len(views) < 2:
         raise InputError(f"{inputs[0]}: one image; a surface needs at least two")
-    crs, geoid, height_system, model = requested
+    crs, geoid, height_system, cells = requested
     if around is None:
         no_height_reference(geoid, height_system)
         reference = HeightReference()
     else:
         reference = heights_of_ground_images(system_of(around, crs), geoid, height_system)
-        if model:
+        if cells is not None:
             check_cells(reference, metres=True)
     if reference.geoid is not None and around is not None and reference.horizontal is not None:
         x, y = _corners(views, around, reference.horizontal)
         computed_heights = reference.as_computed(heights or (0.0, 0.0), x, y)
         heights = heights and computed_heights
     bounds, messages = ground_bounds(views, heights)
+    partners = _partners(pairs, views) or choose_partners(views, bounds)
+    horizontal = reference.horizontal
+
+    def to_xy(X: np.ndarray) -> np.ndarray:
+        if around is None or horizontal is None:
+            return X
+        return np.stack(map_coordinates(X, around, horizontal), 1)
+
+    _check_cells_of(cells, lambda: least_extent(views, bounds, partners, to_xy))
     messages = (*messages, *align_all(views, bounds))
     if around is not None and crs is not None:
         place = (float(np.degrees(float(a))) for a in (around.longitude, around.latitude))
         messages = (*messages, *filter(None, [describe_distance(crs, *place)]))
     _say_all(messages, say)
-    reconstructed = reconstruct_surface(views, bounds, _partners(pairs, views), **options)
+    reconstructed = reconstruct_surface(views, bounds, partners, **options)
     _say_all(reconstructed.messages, say)
     reconstructed = dataclasses.replace(
         reconstructed, messages=(*messages, *reconstructed.messages)
     )
-    if around is None or reference.horizontal is None:
+    if around is None or horizontal is None:
         return _Matched(reconstructed, views, lambda X: X, np.zeros((0, 3)))
-    horizontal = reference.horizontal
     cloud = reference.apply(to_map(reconstructed.cloud, around, horizontal))
     in_map = dataclasses.replace(reconstructed, cloud=cloud)
 
@@ -295,6 +306,16 @@ def _corners(
     X = np.concatenate(corners)
     x, y = map_coordinates(X[np.isfinite(X).all(1)], around, crs)
     return x, y
+
+
+def _check_cells_of(size: float | None, extent: Callable[[], Float[np.ndarray, "2"]]) -> None:
+    """Refuse cells that are far too small before matching, which takes minutes to hours.
+
+    **Arguments:** `extent()`: of the surface in x and y."""
+    if size is not None:
+        with np.errstate(over="ignore"):
+            columns, rows = np.ceil(extent() / size)
+        check_number_of_cells(rows, columns, size)
 
 
 def choose_views(

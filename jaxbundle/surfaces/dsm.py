@@ -121,6 +121,16 @@ class Dsm:
         )
 
 
+def check_number_of_cells(
+    rows: float, columns: float, size: float, settings: DsmSettings = DsmSettings()
+) -> None:
+    """**Raises:** `InputError` for more than `settings.max_cells`."""
+    if rows * columns > settings.max_cells:
+        raise InputError(
+            f"a DSM of {rows:.0f} × {columns:.0f} cells of {size:g} is too large; give larger cells"
+        )
+
+
 def make_dsm(
     cloud: Cloud, size: float, fill: int = 2, settings: DsmSettings = DsmSettings()
 ) -> Dsm:
@@ -135,10 +145,7 @@ def make_dsm(
     column, row = np.floor(cloud.X[:, 0] / size), np.floor(-cloud.X[:, 1] / size)
     left, top = column.min(), row.min()
     columns, rows = int(column.max() - left) + 1, int(row.max() - top) + 1
-    if rows * columns > settings.max_cells:
-        raise InputError(
-            f"a DSM of {rows} × {columns} cells of {size:g} is too large; give larger cells"
-        )
+    check_number_of_cells(rows, columns, size, settings)
     cell = ((row - top) * columns + (column - left)).astype(np.int64)
     # Of the points from the centres of their cells.
     x, y = cloud.X[:, 0] - (column + 0.5) * size, cloud.X[:, 1] + (row + 0.5) * size

@@ -1,13 +1,15 @@
-"""Selection of images to match with each other: overlapping, from different directions."""
+"""Selection of images to match with each other: overlapping, from different directions; the extent
+of their surface."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.surfaces.bounds import Bounds, angle_at
-from jaxbundle.surfaces.views import OrientedImage, is_inside
+from jaxbundle.surfaces.views import OrientedImage, Places, Points, is_inside
 
 
 def choose_partners(
@@ -29,9 +31,8 @@ def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
     # windows are no longer alike; below 1° depths are hardly determined. Only these limits exclude
     # pairs: the weight gives their order.
     narrowest, best_angle, widest = np.radians([1.0, 14.0, 60.0])
-    # 9 × 9 points of the base image at three depths between the bounds
-    u, v = (np.linspace(0.05, 0.95, 9) * (n - 1) for n in view.size)
-    uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    # at three depths between the bounds
+    uv = _sample(view)
     q = bounds(uv)
     best = 0.0
     for share in (0.25, 0.5, 0.75):
@@ -46,6 +47,36 @@ def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
             worth = min(angle / best_angle, 1.0) * min(1.0, wide)
             best = max(best, float(is_seen.mean()) * worth)
     return best
+
+
+def least_extent(
+    views: Sequence[OrientedImage],
+    bounds: Sequence[Bounds],
+    partners: Mapping[int, Sequence[int]],
+    to_map: Callable[[Points], Points] = lambda X: X,
+) -> Float[np.ndarray, "2"]:
+    """The extent of what base images and a partner see, in x and y of a map: at the lowest, the
+    middle or the highest depth between the bounds, wherever it is smallest.
+
+    **Arguments:** `to_map`: from the coordinates of the images."""
+    extents = []
+    for share in (0.0, 0.5, 1.0):
+        seen = []
+        for i, others in partners.items():
+            uv = _sample(views[i])
+            q = bounds[i](uv)
+            X = views[i].points(uv, q[:, 0] + share * (q[:, 1] - q[:, 0]))
+            is_seen = np.any([is_inside(views[j], views[j].project(X)) for j in others], axis=0)
+            seen.append(X[is_seen & np.isfinite(X).all(1)])
+        X = np.concatenate(seen) if seen else np.zeros((0, 3))
+        extents.append(np.ptp(to_map(X)[:, :2], axis=0) if len(X) else np.zeros(2))
+    return min(extents, key=np.prod)
+
+
+def _sample(view: OrientedImage) -> Places:
+    """9 × 9 pixels of an image."""
+    u, v = (np.linspace(0.05, 0.95, 9) * (n - 1) for n in view.size)
+    return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 
 
 def parse_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list[int]]:

@@ -247,6 +247,26 @@ def test_rpc_images_become_a_cloud_in_a_map_system(satellite, tmp_path, command,
     assert 0.55 < np.sqrt(np.mean(w[np.abs(w) < 5] ** 2)) < 1.3
 
 
+def no_work(*_, **options):
+    raise AssertionError("the images are matched")
+
+
+def test_cells_that_are_far_too_small_are_refused_before_the_work(
+    project, satellite, tmp_path, command, monkeypatch
+):
+    monkeypatch.setattr("jaxbundle.commands.surface.reconstruct_surface", no_work)
+    monkeypatch.setattr("jaxbundle.commands.surface.align_all", no_work)
+    photographs, images = project[0], satellite[0]
+    for given in ((photographs, "--photos", photographs / "photos", "--zmin", -1.5, "--zmax", 3),
+                  (images / "a.tif", images / "b.tif", "--zmin", 170, "--zmax", 230)):  # fmt: skip
+        for size in (1e-5, 1e-320):
+            told = command("surface", *given, "--out", tmp_path / "out", "--dsm", size)
+            assert told.status == 2 and "too large; give larger cells" in told.err
+    # 7 m below the cameras a photograph has 7 × 5.25 m, of which a base of 2 m is not in common
+    with pytest.raises(InputError, match=r"a DSM of 4\d{5} × 4\d{5} cells of 1e-05"):
+        jaxbundle.surface(photographs, photos=photographs / "photos", zmin=-1.5, zmax=3, dsm=1e-5)
+
+
 def test_one_image_twice(satellite, tmp_path, command):
     folder, _ = satellite
     told = command("surface", folder / "a.tif", folder / "a.tif", "--out", tmp_path / "out")
