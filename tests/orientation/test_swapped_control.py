@@ -178,8 +178,9 @@ def test_two_exchanged_points_of_five_are_named_whatever_images_they_orient(seed
     camera = Camera("cam", "opencv", {"fx": 3200.0, "fy": 3200.0, "cx": 1999.5, "cy": 1499.5})
     start = dataclasses.replace(camera, parameters=camera.parameters | {"fx": 3150.0, "fy": 3150.0})
     network = jaxbundle.simulate(
-        jaxbundle.ring_of_stations(6, 4.0, 6.0, roll_every=2), targets, camera, noise=0.3, start=start,
-        control=range(5), control_sigma=0.002, datum="control", image_format=(4000, 3000),
+        jaxbundle.ring_of_stations(6, 4.0, 6.0, roll_every=2), targets, camera, noise=0.3,
+        start=start, control=range(5), control_sigma=0.002, datum="control",
+        image_format=(4000, 3000),
     )  # fmt: skip
     images, points = network.images, network.points
     position, order = points.position.copy(), list(range(5))
