@@ -24,7 +24,7 @@ from jaxbundle.adjustment.problem import NetworkProblem, coordinates, with_coord
 from jaxbundle.leastsquares.indexing.rows import Values
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import list_some
-from jaxbundle.network.equation_counts import equations_of
+from jaxbundle.network.equation_counts import equations_of, name_undetermined_points
 from jaxbundle.network.noise import noise_of_rays
 from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import LeftOut, Network, are_among
@@ -292,8 +292,9 @@ def readmit(
     )
     network = keep_points(keep_images(network, model.placed), is_known & ~line)
     reason = "that the adjusted orientation does not determine either"
-    network = note_missing(network, network_as_given, "image", missing_images, reason)
-    network = note_missing(network, network_as_given, "point", missing_points, reason)
+    undetermined = name_undetermined_points(network_as_given)
+    network = note_missing(network, "image", missing_images, reason)
+    network = note_missing(network, "point", missing_points, reason, undetermined)
     for note in _notes(network_as_given, agreeing, line, one_place, np.zeros(len(images), bool)):
         network = record_left_out(network, note.thing, note.names, note.why)
     rays = network_as_given.observations

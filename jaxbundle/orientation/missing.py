@@ -1,12 +1,11 @@
 """Why images and points have no start values, and notes of what is left out for it."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from jaxtyping import Bool
 
 from jaxbundle.network.columns import count, list_some
-from jaxbundle.network.equation_counts import name_undetermined_points
 from jaxbundle.network.tables import LeftOut, Network
 from jaxbundle.orientation.incremental import (
     Model,
@@ -16,13 +15,17 @@ from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
 
 def note_missing(
-    network: Network, given: Network, noun: str, reasons: Mapping[str, str], clause: str
+    network: Network,
+    noun: str,
+    reasons: Mapping[str, str],
+    clause: str,
+    undetermined: Collection[str] = (),
 ) -> Network:
-    """The network with notes that images or points of the one `given` were left out, by name with
-    the reasons."""
+    """The network with notes that images or points were left out, by name with the reasons;
+    `undetermined`: those that no start values would make determinable
+    (`name_undetermined_points`)."""
     if not reasons:
         return network
-    undetermined = name_undetermined_points(given) if noun == "point" else frozenset()
     names = list_some((f"{id} ({why})" for id, why in reasons.items()), 5, str)
     groups: dict[tuple[str, bool], list[str]] = {}
     for id, why in reasons.items():

@@ -27,6 +27,7 @@ from jaxbundle.display import print_in_one_screen
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, list_some
+from jaxbundle.network.equation_counts import name_undetermined_points
 from jaxbundle.network.subsets import keep_images, keep_points, record_left_out
 from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
@@ -423,10 +424,10 @@ def _result(
     )
     network = keep_points(keep_images(network, keep), has_coordinates)
     network = network.note(f"start values found, {frame}")
-    for noun, reason_by_id in zip(("image", "point"), reasons):
-        network = note_missing(
-            network, given, noun, reason_by_id, "for which no start values were found"
-        )
+    clause, (images_missing, points_missing) = "for which no start values were found", reasons
+    network = note_missing(network, "image", images_missing, clause)
+    undetermined = name_undetermined_points(given)
+    network = note_missing(network, "point", points_missing, clause, undetermined)
     names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in gross_rows)
     network = record_left_out(network, "image point", names, CONTRADICTION)
     return Oriented(network, frame, *reasons, names)

@@ -122,7 +122,8 @@ def without_returned(network: Network, ids: tuple[str, ...]) -> Network:
             notes=tuple(note for note in network.notes if not said.match(note)),
             left_out=tuple(one for one in network.left_out if one not in of_clause),
         )
-        network = note_missing(network, "point", reasons, clause)
+        undetermined = {name for one in of_clause if not one.measured for name in one.names}
+        network = note_missing(network, "point", reasons, clause, undetermined)
     return network.replace(left_out=without_names(network.left_out, ids))
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -106,13 +107,15 @@ def find_named(
                 tuple(np.zeros((0, 2)) if p is None else p.sigma for p in uncoded_targets),
             )
     if control is not None and control.sightings:
-        index = {p.name: k for k, p in enumerate(photographs)}
-        unknown = sorted({file for file, _ in control.sightings if file not in index})
+        files = sorted({file for file, _ in control.sightings})
+        names = [photograph.name for photograph in photographs]
+        index = _find_by_name(files, names)
+        unknown = [file for file in files if file not in index]
         # All: another folder was given; some: photographs that were left out of it.
-        if len(unknown) == len({file for file, _ in control.sightings}):
+        if not index:
             raise InputError(
-                f"{control.points.source.name}: measured in none of the photographs, but in "
-                f"{list_some(unknown, 3, str)}"
+                f"{control.points.source.name}: measured in none of the photographs "
+                f"({list_some(names, 3, str)}), but in {list_some(unknown, 3, str)}"
             )
         if unknown:
             notes.append(f"control measured in missing photographs: {list_some(unknown)}")
@@ -133,6 +136,27 @@ def find_named(
         return no_named_points(), discs, notes
     columns = np.array(image), tuple(name), np.array(xy, float), np.array(sigma, float)
     return NamedMeasurements(*columns), discs, notes
+
+
+def _find_by_name(files: Sequence[str], names: Sequence[str]) -> dict[str, int]:
+    """By file the photograph of this name; else the only one whose name differs by case, or only by
+    case and suffix."""
+    index: dict[str, int] = {}
+    stem = lambda name: os.path.splitext(name.casefold())[0]
+    for of_name, of_file in (
+        (str, str),
+        (str.casefold, str.casefold),
+        (stem, str.casefold),
+        (stem, stem),
+    ):
+        numbers: dict[str, list[int]] = {}
+        for k, name in enumerate(names):
+            numbers.setdefault(of_name(name), []).append(k)
+        for file in files:
+            same_name = numbers.get(of_file(file), [])
+            if file not in index and len(same_name) == 1 and same_name[0] not in index.values():
+                index[file] = same_name[0]
+    return index
 
 
 def join_named(first_part: NamedMeasurements, second_part: NamedMeasurements) -> NamedMeasurements:

@@ -157,8 +157,22 @@ def test_measurements_in_missing_photographs_are_reported(tmp_path):
     control = read_control_measurements(written(tmp_path, text))
     found, _, notes = find_named([SimpleNamespace(name="a.jpg")], None, control)
     assert found.name == ("A",) and notes == ["control measured in missing photographs: 'b.jpg'"]
-    with pytest.raises(InputError, match="measured in none of the photographs, but in a.jpg, b"):
+    none = r"measured in none of the photographs \(c.jpg\), but in a.jpg, b"
+    with pytest.raises(InputError, match=none):
         find_named([SimpleNamespace(name="c.jpg")], None, control)
+
+
+@pytest.mark.parametrize("names, image", [
+    (("A.JPG", "B.JPG"), [0, 1, 1]), (("b", "a"), [1, 0, 0]), (("a.png", "b.tif"), [0, 1, 1]),
+    (("A.jpg", "a.png", "b.jpg"), [0, 2, 2]), (("a.png", "a.tif", "b.jpg"), [2, 2]),
+    (("A", "a.jpg", "B.PNG"), [1, 2, 2]),
+])  # fmt: skip
+def test_photographs_of_control_are_known_without_case_and_suffix(tmp_path, names, image):
+    """If only one has the name; exact names first."""
+    text = "id,X,Y,Z,image,u,v\nA,1,2,3,a.jpg,10,20\nA,1,2,3,b.jpg,11,21\nB,4,2,3,b.jpg,1,2\n"
+    control = read_control_measurements(written(tmp_path, text))
+    found, *_ = find_named([SimpleNamespace(name=name) for name in names], None, control)
+    assert found.image.tolist() == image
 
 
 def test_a_point_measured_by_hand_where_its_target_is_found_is_refused(tmp_path, monkeypatch):
