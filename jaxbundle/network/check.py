@@ -293,7 +293,7 @@ def _check_observations(network: Network) -> None:
         raise InputError(
             f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
             f"{sigma[row, k]:g}; it must be "
-            f"{sigma_requirement(float(sigma[row, k]), 'finite and positive')}: correct it, or leave it "
+            f"{sigma_requirement(sigma[row, k], 'finite and positive')}: correct it, or leave it "
             "empty to use sigma_image"
         )
     for row, k in np.argwhere(sigma < last_digit)[:1]:

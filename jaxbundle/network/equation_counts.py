@@ -18,8 +18,6 @@ from jaxbundle.network.tables import (
     Points,
 )
 
-EQUATIONS_OF_A_POINT = 3  # one for each coordinate
-
 
 def count_controlled_axes(points: Points) -> Int[np.ndarray, " points"]:
     """The number of known coordinates of each point: fixed 3, control those with a finite σ."""
@@ -61,7 +59,12 @@ def name_undetermined_points(network: Network) -> frozenset[str]:
     )
     equations = 2 * rays + distance_counts
     equations += count_controlled_axes(points) + equations_of(network, "POINTS")
-    return frozenset(points.id[row] for row in np.flatnonzero(equations < EQUATIONS_OF_A_POINT))
+    return frozenset(points.id[row] for row in np.flatnonzero(~_determine_points(equations)))
+
+
+def _determine_points(equations: Int[np.ndarray, " points"]) -> Bool[np.ndarray, " points"]:
+    """Which numbers of equations are enough for a point: one for each coordinate."""
+    return equations >= 3
 
 
 def leave_out_with_too_few_rays(network: Network) -> Network:
@@ -81,7 +84,7 @@ def leave_out_with_too_few_rays(network: Network) -> Network:
     while True:
         rays, distance_counts = _count_measurements(network, points_kept, images_kept)
         equations = 2 * rays + distance_counts + point_equations
-        determined = is_fixed | (equations >= EQUATIONS_OF_A_POINT)
+        determined = is_fixed | _determine_points(equations)
         # Fixed points that no image sees add nothing, nor do images without points, whatever is
         # known of them.
         next_points_kept = points_kept & np.where(

@@ -21,7 +21,7 @@ def is_usable_sigma(sigma: Float[np.ndarray, " *shape"] | float) -> Bool[np.ndar
     return (sigma >= 1 / LARGEST) & (sigma <= LARGEST)
 
 
-def sigma_requirement(sigma: float, positive: str = "positive") -> str:
+def sigma_requirement(sigma: Float[np.ndarray, ""] | float, positive: str = "positive") -> str:
     """What a σ that cannot be used must be, in words; `positive`: where it is no positive
     number."""
     return f"between {1 / LARGEST:g} and {LARGEST:g}" if 0 < sigma < np.inf else positive

@@ -11,12 +11,6 @@ from jaxbundle.network.units import METRES
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
-FOOT = METRES["ft"]
-# How many times better points must fit with other axes for these to be refused, and to be doubted.
-# Of 18 000 right models each, of 4 to 8 points with noise of 0.5 and 2 % of their extent, none was
-# refused and up to 0.13 % were doubted for one of the mistakes. With heights over 2 to 50 % of the
-# extent and noise of 0.5 %, 47 % of mirror images are refused and 62 % doubted (of 2 %: 14 and 24).
-REFUSED, DOUBTED = 5.0, 2.5
 # By the factors of the axes with which control fits: how it fits, and what to correct.
 MISTAKES = {
     (-1.0, 1.0, 1.0): (
@@ -24,11 +18,11 @@ MISTAKES = {
         "X and Y are exchanged, or one of X, Y, Z has the wrong sign, or the image coordinates "
         "count y downward; reverse one axis",
     ),
-    (1.0, 1.0, FOOT): (
+    (1.0, 1.0, METRES["ft"]): (
         "with heights in feet",
         "X, Y and Z have different units; give all of them in one",
     ),
-    (1.0, 1.0, 1 / FOOT): (
+    (1.0, 1.0, 1 / METRES["ft"]): (
         "with X and Y in feet",
         "X, Y and Z have different units; give all of them in one",
     ),
@@ -39,19 +33,20 @@ def describe_wrong_axes(
     source: Float[np.ndarray, "n 3"],
     target: Float[np.ndarray, "n 3"],
     unit: str,
-    times_better: float = REFUSED,
     settings: StartValueSettings = DEFAULTS,
+    times_better: float | None = None,
 ) -> str:
     """The mistake of `MISTAKES` without which control points (`target`) fit a model (`source`) so
-    many times better, in words; empty if there is none, or if undecidable (fewer than four points,
-    or points in a plane that a mistake leaves as it is)."""
+    many times better (default: `settings.refused_axes`), in words; empty if there is none, or if
+    undecidable (fewer than four points, or points in a plane that a mistake leaves as it is)."""
     if len(source) < 4:  # a triangle turned over is its own mirror image
         return ""
     plain = _misfit(source, target)
     misfits = {axes: _misfit(source, target * axes) for axes in MISTAKES}
     axes = min(misfits, key=misfits.__getitem__)
     extent = float(np.ptp(target, axis=0).max())
-    if not misfits[axes] < min(plain / times_better, extent / settings.extent_to_misfit):
+    ratio = settings.refused_axes if times_better is None else times_better
+    if not misfits[axes] < min(plain / ratio, extent / settings.extent_to_misfit):
         return ""
     how, remedy = MISTAKES[axes]
     return (

@@ -253,7 +253,7 @@ def _describe_wrong_axes(network: Network, sights: Sights, settings: StartValueS
         return ""
     control = are_controlled(network.points) & model.known
     positions = model.X[control], network.points.position[control]
-    return describe_wrong_axes(*positions, network.object_unit, settings=settings)
+    return describe_wrong_axes(*positions, network.object_unit, settings)
 
 
 def _orient(

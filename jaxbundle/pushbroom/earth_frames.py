@@ -20,6 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.types import Numbers
 
@@ -29,10 +30,8 @@ EARTH_RATE = 7.292115e-5
 # Geocentric gravitational constant, m³/s² (WGS 84).
 GM = 3.986004418e14
 ARCSECOND = np.pi / 648000
-# The equator of WGS 84, metres, above which the height of an orbit is.
-EQUATOR = 6378137.0
-# The edge of space (FAI), metres: lower satellites are stopped by the air within a revolution.
-LOWEST_ORBIT = 100e3
+# The radius of the equator above which the height of an orbit is, metres.
+EQUATOR = float(WGS84.a)
 # Seconds of a day; ERFA's quasi Julian date of UTC stretches the day of a leap second.
 DAY = 86400.0
 
@@ -165,14 +164,15 @@ def two_line_orbit(
     return turn_positions(R, 1e3 * km, 1e3 * km_s, orientation)
 
 
-def check_orbit_height(height: float, where: str = "") -> None:
+def check_orbit_height(height: float, where: str = "", lowest: float = 100e3) -> None:
     """Refuse the height of a circular orbit on which no satellite stays, metres; `where` begins
-    the message.
+    the message. `lowest`: the edge of space (FAI), below which the air stops satellites within a
+    revolution.
 
     **Raises:** `InputError`."""
-    if not height >= LOWEST_ORBIT:
+    if not height >= lowest:
         raise InputError(
-            f"{where}height is {height:g}; expected metres above the equator, {LOWEST_ORBIT:g} or "
+            f"{where}height is {height:g}; expected metres above the equator, {lowest:g} or "
             "more of an orbit: is it in kilometres?"
         )
 

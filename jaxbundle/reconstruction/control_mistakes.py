@@ -10,7 +10,8 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Points
-from jaxbundle.orientation.control_axes import DOUBTED, describe_wrong_axes
+from jaxbundle.orientation.control_axes import describe_wrong_axes
+from jaxbundle.orientation.settings import DEFAULTS
 from jaxbundle.reconstruction.oriented_block import MIN_CONTROL, MeasuredPoint, OrientedBlock
 
 
@@ -24,7 +25,7 @@ def refuse_wrong_axes(block: OrientedBlock, control: Points, usable: Sequence[in
     positions = block.X[rows], control.position[places]
     if wrong := describe_wrong_axes(*positions, "m"):
         raise InputError(wrong)
-    return describe_wrong_axes(*positions, "m", DOUBTED)
+    return describe_wrong_axes(*positions, "m", times_better=DEFAULTS.doubted_axes)
 
 
 def refuse_wrong_columns(block: OrientedBlock, measured: Mapping[str, MeasuredPoint]) -> None:

@@ -8,17 +8,16 @@ window has enough cells, and damps slopes of windows that all fit badly.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from jaxtyping import Float, Int
 
 # Steps in rows and columns to the cells of a window, its middle first.
-WINDOW = ((0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+WINDOW = tuple(itertools.product((0, -1, 1), repeat=2))
 # Cells with which a window has points in all three rows and all three columns. In two a step cannot
 # be told from a slope.
 LEAST_CELLS = 7
-# Windows that are computed at a time: their moments take 32 MB.
-CHUNK = 2**17
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,17 +35,18 @@ class CellMeans:
 
 
 def cell_slopes(
-    cells: CellMeans, prior: float, step: float, wall: float
+    cells: CellMeans, prior: float, step: float, wall: float, at_once: int = 2**17
 ) -> tuple[Float[np.ndarray, "2 k"], Float[np.ndarray, "2 2 k"]]:
     """∂z/∂x and ∂z/∂y of the cells and their covariances.
 
     **Arguments:** `prior`: σ of each slope a priori; `step`: ratio of the variance factors of the
     window around a cell and of another with it above which the other is taken; `wall`: standard
-    deviation of the heights of a window, in cell sizes, above which it has no slope.
+    deviation of the heights of a window, in cell sizes, above which it has no slope; `at_once`:
+    windows that are computed at a time, whose moments take 32 MB.
     """
     n = len(cells.number)
     slope, covariance = np.empty((2, n)), np.empty((2, 2, n))
-    parts = [slice(begin, min(begin + CHUNK, n)) for begin in range(0, n, CHUNK)]
+    parts = [slice(begin, min(begin + at_once, n)) for begin in range(0, n, at_once)]
     # The last one is that of cells without points, which are no windows.
     normal, right, variance = np.zeros((2, 2, n + 1)), np.zeros((2, n + 1)), np.full(n + 1, np.inf)
     for part in parts:

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxbundle.orientation.control_axes import DOUBTED, FOOT, describe_wrong_axes
+from jaxbundle.orientation.control_axes import describe_wrong_axes
+from jaxbundle.orientation.settings import DEFAULTS
 
+FOOT, DOUBTED = 0.3048, DEFAULTS.doubted_axes
 RNG = np.random.default_rng(4)
 X = RNG.uniform(-1, 1, (7, 3)) * [20, 15, 4]
 MODEL = 0.3 * X @ Rotation.from_euler("xyz", [0.4, -0.3, 2]).as_matrix() + [1, 2, 3]
@@ -35,15 +37,15 @@ def test_what_noise_could_explain_is_only_doubted():
     noise = np.random.default_rng(1).normal(size=X.shape)
     control = X[:, [1, 0, 2]] + 0.8 * noise
     assert not describe_wrong_axes(MODEL, control, "m")
-    assert "mirror image" in describe_wrong_axes(MODEL, control, "m", DOUBTED)
+    assert "mirror image" in describe_wrong_axes(MODEL, control, "m", times_better=DOUBTED)
 
 
 def test_nothing_is_said_of_three_points_or_of_a_plane():
-    assert not describe_wrong_axes(MODEL[:3], X[:3, [1, 0, 2]], "m", DOUBTED)
+    assert not describe_wrong_axes(MODEL[:3], X[:3, [1, 0, 2]], "m", times_better=DOUBTED)
     plane = X * [1, 1, 0]
-    assert not describe_wrong_axes(plane, plane[:, [1, 0, 2]], "m", DOUBTED)
+    assert not describe_wrong_axes(plane, plane[:, [1, 0, 2]], "m", times_better=DOUBTED)
 
 
 def test_exchanged_names_are_no_mirror_image():
     names = [1, 0, 2, 3, 4, 5, 6]
-    assert not describe_wrong_axes(MODEL, X[names], "m", DOUBTED)
+    assert not describe_wrong_axes(MODEL, X[names], "m", times_better=DOUBTED)

@@ -1,6 +1,7 @@
 """Clouds: filters against counting by hand, files that read back equal, a DSM of a known plane."""
 
 import dataclasses
+import functools
 
 import ezdxf
 import laspy
@@ -15,7 +16,7 @@ from jaxbundle import plotting
 from jaxbundle.errors import InputError
 from jaxbundle.planning.texture import Texture
 from jaxbundle.surfaces.accuracy import accuracy_of, at_check_points, to_plane
-from jaxbundle.surfaces.cell_slopes import WINDOW, CellMeans, _neighbours
+from jaxbundle.surfaces.cell_slopes import WINDOW, CellMeans, _neighbours, cell_slopes
 from jaxbundle.surfaces.cloud import Cloud, empty_cloud, merge
 from jaxbundle.surfaces.cloud_filters import drop_isolated, drop_weak, thin
 from jaxbundle.surfaces.compare import compare
@@ -336,7 +337,8 @@ def test_slopes_of_parts_are_those_of_all_cells(monkeypatch):
     """Windows reach over the borders of the parts that are computed at a time."""
     cloud = points_of(lambda x, y: np.sin(x) + 0.3 * y)
     whole = make_dsm(cloud, 1.0)
-    monkeypatch.setattr("jaxbundle.surfaces.cell_slopes.CHUNK", 17)
+    in_parts = functools.partial(cell_slopes, at_once=17)
+    monkeypatch.setattr("jaxbundle.surfaces.dsm.cell_slopes", in_parts)
     parts = make_dsm(cloud, 1.0)
     np.testing.assert_array_equal(parts.height, whole.height)
     np.testing.assert_array_equal(parts.sigma, whole.sigma)
