@@ -15,9 +15,6 @@ from jaxtyping import Float, Int
 
 # Steps in rows and columns to the cells of a window, its middle first.
 WINDOW = tuple(itertools.product((0, -1, 1), repeat=2))
-# Cells with which a window has points in all three rows and all three columns. In two a step cannot
-# be told from a slope.
-LEAST_CELLS = 7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,10 +77,12 @@ def _neighbours(cells: CellMeans, part: slice) -> Int[np.ndarray, "9 m"]:
 
 
 def _planes(
-    cells: CellMeans, part: slice, wall: float
+    cells: CellMeans, part: slice, wall: float, least_cells: int = 7
 ) -> tuple[Float[np.ndarray, "2 2 m"], Float[np.ndarray, "2 m"], Float[np.ndarray, " m"]]:
     """Reduced normal equations N·s = b of the slopes in the windows around some cells, and their
-    variance factors: ∞, with N and b of 0, for those of too few cells or with a wall."""
+    variance factors: ∞, with N and b of 0, for those with a wall, or of fewer than `least_cells`:
+    seven are in all three rows and all three columns, and in two a step cannot be told from a
+    slope."""
     moments = np.zeros((4, 4, len(cells.number[part])))
     count = np.zeros(moments.shape[2:])
     extended = lambda values: np.append(values, 0.0)
@@ -99,7 +98,7 @@ def _planes(
     normal, right = reduced[:2, :2], reduced[:2, 2]
     determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
     # A cell of far larger weight than the others leaves the slope open but for rounding.
-    is_plane = count >= LEAST_CELLS
+    is_plane = count >= least_cells
     is_plane &= reduced[2, 2] <= (wall * cells.size) ** 2 * moments[0, 0]
     is_plane &= determinant > 1e-8 * normal[0, 0] * normal[1, 1]
     normal, right = np.where(is_plane, normal, 0.0), np.where(is_plane, right, 0.0)
