@@ -105,6 +105,7 @@ def test_the_table_in_words_and_as_data(table, tmp_path, capsys):
     (["--table", "drift"], ["'drift'", "bias, white"]),
     (["--table", "bias", "--levels", "0,1"], ["--levels '0,1'", "0.01,0.1"]),
     (["--table", "bias", "--dem", "x.tif"], ["--dem", "--height"]),
+    (["--table", "bias", "--attitude-white", "5"], ["--attitude-white", "--table"]),
 ])  # fmt: skip
 def test_what_is_refused(monkeypatch, capsys, options, words):
     monkeypatch.setattr(sys, "argv", ["jaxbundle", "pushbroom", "accuracy", str(FLIGHT), *options])

@@ -83,12 +83,22 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     check_accept(accept, "pushbroom accuracy")
     check_outputs([scanner, truth, dem, geoid], csv=csv, json=json, map=map_)
     if map_ is not None:
-        _check_map(map_, table)
+        _check_map(map_)
     if table:
-        if accept:
-            raise InputError("--accept: not available with --table; omit one of them")
         if dem is not None:
             raise InputError("--dem: use --height with --table; terrain has no reverse mode")
+        _refuse_beside_table(
+            accept=accept,
+            map=map_,
+            truth=truth,
+            geoid=geoid,
+            attitude_bias=attitude_bias,
+            attitude_drift=attitude_drift,
+            attitude_white=attitude_white,
+            position_bias=position_bias,
+            position_drift=position_drift,
+            position_white=position_white,
+        )
         kind = cast(AttitudeError, table)
         write_table(table_of(scanner, kind, levels, draws, seed, height), csv, json)
         return
@@ -119,9 +129,15 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     end_unmet(acceptance)
 
 
-def _check_map(path: Path, table: str | None) -> None:
-    if table:
-        raise InputError("--map: not available with --table; omit one of them")
+def _refuse_beside_table(**options: object) -> None:
+    """Refuse options that the table of a flight has no use for: it has errors of its own."""
+    for name, value in options.items():
+        if value:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option}: not available with --table; omit one of them")
+
+
+def _check_map(path: Path) -> None:
     if path.suffix.lower() not in (".tif", ".tiff", ".png"):
         raise InputError(f"--map {path}: expected a name that ends in .tif or .png")
     if not path.absolute().parent.is_dir():
