@@ -236,7 +236,7 @@ def test_a_surface_moves_with_a_free_network_and_a_held_one_fixes_it(above):
     ({"radius": 0.1}, "a flat interface has no radius"),
     ({"sX": 0.1}, "a flat interface has no sX"),
     ({"Z": 0.03}, "the camera looks along −z"),
-    ({"sindex": -1.0}, "sindex is not positive"),
+    ({"sindex": -1.0}, "sindex is -1; it must be positive"),
     ({"sindex_camera": 0.1}, "sindex_camera is given, but no index_camera"),
     ({"distance": 1.0}, "unknown column 'distance'"),
     (DOME | {"radius": None}, "radius is missing"),

@@ -257,7 +257,7 @@ def test_jacobians(simulated):
     ({"mounting": {"right": {}}}, r"\[rig.mounting.right\]: give position, angles, or both"),
     ({"mounting": {"right": {"positon": [1, 2, 3]}}}, "unknown key 'positon'"),
     ({"mounting": {"right": {"position": [1, 2]}}}, "expected 3 numbers"),
-    ({"mounting": {"right": GIVEN | {"sigma_angle": 0}}}, "a positive number, or three"),
+    ({"mounting": {"right": GIVEN | {"sigma_angle": 0}}}, "expected one σ, or three, positive"),
     ({"mounting": {"right": {"angles": [0, 0, 0], "sigma_position": 1}}}, "without position"),
     ({"mounting": {"right": GIVEN | {"covariance": [[0] * 6] * 6}}}, "positive definite"),
     ({"mounting": {"right": GIVEN | {"covariance": np.eye(6).tolist(), "sigma_angle": 1}}},

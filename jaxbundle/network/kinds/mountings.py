@@ -144,7 +144,7 @@ def _sigmas(section: str, key: str, setting: Any) -> Float[np.ndarray, "3"]:
     unusable = sigma[~(is_usable_sigma(sigma) | np.isposinf(sigma))]
     if len(unusable):
         raise InputError(
-            f"[{section}]: {key} is {show(setting)}; expected a number, or three, "
+            f"[{section}]: {key} is {show(setting)}; expected one σ, or three, "
             f"{sigma_requirement(unusable[0])} (inf: nothing is known of an axis)"
         )
     return sigma
