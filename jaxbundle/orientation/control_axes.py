@@ -11,6 +11,7 @@ from jaxbundle.network.units import METRES
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.orientation.settings import DEFAULTS, StartValueSettings
 
+TWO_UNITS = "X, Y and Z have different units; give all of them in one"
 # By the factors of the axes with which control fits: how it fits, and what to correct.
 MISTAKES = {
     (-1.0, 1.0, 1.0): (
@@ -18,14 +19,8 @@ MISTAKES = {
         "X and Y are exchanged, or one of X, Y, Z has the wrong sign, or the image coordinates "
         "count y downward; reverse one axis",
     ),
-    (1.0, 1.0, METRES["ft"]): (
-        "with heights in feet",
-        "X, Y and Z have different units; give all of them in one",
-    ),
-    (1.0, 1.0, 1 / METRES["ft"]): (
-        "with X and Y in feet",
-        "X, Y and Z have different units; give all of them in one",
-    ),
+    (1.0, 1.0, METRES["ft"]): ("with heights in feet", TWO_UNITS),
+    (1.0, 1.0, 1 / METRES["ft"]): ("with X and Y in feet", TWO_UNITS),
 }
 
 
@@ -50,8 +45,8 @@ def describe_wrong_axes(
         return ""
     how, remedy = MISTAKES[axes]
     return (
-        f"the {len(source)} control points fit the images only {how} (by {misfits[axes]:.3g} "
-        f"{unit}, otherwise {plain:.3g}): {remedy}"
+        f"the {len(source)} control points fit the images better {how} (by {misfits[axes]:.3g} "
+        f"{unit} instead of {plain:.3g}): {remedy}"
     )
 
 

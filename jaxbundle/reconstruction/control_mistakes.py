@@ -16,8 +16,8 @@ from jaxbundle.reconstruction.oriented_block import MIN_CONTROL, MeasuredPoint, 
 
 
 def refuse_wrong_axes(block: OrientedBlock, control: Points, usable: Sequence[int]) -> str:
-    """Refuse control that fits the block only with other axes or units; what fits better with
-    them, but might by chance, in words.
+    """Refuse control that fits the block with other axes or units alone. Where its own errors could
+    be why it fits better with them, that it does, in words; else empty.
 
     **Raises:** `InputError`."""
     places = [k for k in usable if not np.isinf(control.sigma[k]).any()]
@@ -25,7 +25,8 @@ def refuse_wrong_axes(block: OrientedBlock, control: Points, usable: Sequence[in
     positions = block.X[rows], control.position[places]
     if wrong := describe_wrong_axes(*positions, "m"):
         raise InputError(wrong)
-    return describe_wrong_axes(*positions, "m", times_better=DEFAULTS.doubted_axes)
+    doubt = describe_wrong_axes(*positions, "m", times_better=DEFAULTS.doubted_axes)
+    return f"{doubt}; or its errors are that large" if doubt else ""
 
 
 def refuse_wrong_columns(block: OrientedBlock, measured: Mapping[str, MeasuredPoint]) -> None:
@@ -39,14 +40,22 @@ def refuse_wrong_columns(block: OrientedBlock, measured: Mapping[str, MeasuredPo
         return
     if len(several) - meeting < MIN_CONTROL:
         return  # too few of them to say more than that control is missing
-    misses = [block.smallest_miss(point) for point in several if point.good.sum() < 2]
+    misses = np.array([block.smallest_miss(point) for point in several if point.good.sum() < 2])
     words = (
         f"of {count(len(several), 'control point')} measured in two photographs or more the rays "
-        f"of {meeting} meet; those of the others miss each other by {np.median(misses):.0f} pixels "
-        "(median of their nearest two)"
+        f"of {meeting} meet"
     )
+    # Infinite where they meet behind a camera.
+    if len(finite := misses[np.isfinite(misses)]):
+        words += (
+            f"; the nearest two of the others miss each other by {np.median(finite):.0f} pixels "
+            "(median)"
+        )
     exchanged, upwards = block.frame.named.xy[:, ::-1], _upwards(block)
-    for xy, mistake in ((exchanged, "u and v exchanged"), (upwards, "v counted from the top")):
+    for xy, mistake in (
+        (exchanged, "u and v exchanged"),
+        (upwards, "v counted from the other edge"),
+    ):
         named = dataclasses.replace(block.frame.named, xy=xy)
         frame = dataclasses.replace(block.frame, named=named)
         others = OrientedBlock(block.result, frame, block.settings).resolve()

@@ -100,7 +100,7 @@ def _planes(
     # A cell of far larger weight than the others leaves the slope open but for rounding.
     is_plane = count >= least_cells
     is_plane &= reduced[2, 2] <= (wall * cells.size) ** 2 * moments[0, 0]
-    is_plane &= determinant > 1e-8 * normal[0, 0] * normal[1, 1]
+    is_plane &= determinant > np.sqrt(np.finfo(float).eps) * normal[0, 0] * normal[1, 1]
     normal, right = np.where(is_plane, normal, 0.0), np.where(is_plane, right, 0.0)
     inverse = _inverse(np.where(is_plane, normal, np.eye(2)[..., None]))
     square = reduced[2, 2] - np.einsum("ik,ijk,jk->k", right, inverse, right)

@@ -84,33 +84,25 @@ def accuracy(  # noqa: PLR0913 - the options of the command
     check_outputs([scanner, truth, dem, geoid], csv=csv, json=json, map=map_)
     if map_ is not None:
         _check_map(map_)
+    sigmas = {
+        "attitude_bias": attitude_bias,
+        "attitude_drift": attitude_drift,
+        "attitude_white": attitude_white,
+        "position_bias": position_bias,
+        "position_drift": position_drift,
+        "position_white": position_white,
+    }
     if table:
         if dem is not None:
             raise InputError("--dem: use --height with --table; terrain has no reverse mode")
-        _refuse_beside_table(
-            accept=accept,
-            map=map_,
-            truth=truth,
-            geoid=geoid,
-            attitude_bias=attitude_bias,
-            attitude_drift=attitude_drift,
-            attitude_white=attitude_white,
-            position_bias=position_bias,
-            position_drift=position_drift,
-            position_white=position_white,
-        )
+        _refuse_beside_table(accept=accept, map=map_, truth=truth, geoid=geoid, **sigmas)
         kind = cast(AttitudeError, table)
         write_table(table_of(scanner, kind, levels, draws, seed, height), csv, json)
         return
     result = line_scanners.accuracy(
         scanner,
         truth=truth,
-        attitude_bias=attitude_bias,
-        attitude_drift=attitude_drift,
-        attitude_white=attitude_white,
-        position_bias=position_bias,
-        position_drift=position_drift,
-        position_white=position_white,
+        **sigmas,
         draws=draws,
         seed=seed,
         grid=grid_of(grid),
