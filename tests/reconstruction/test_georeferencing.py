@@ -111,7 +111,7 @@ def test_control_that_fits_better_as_a_mirror_image_is_doubted(drone, handheld):
 
 @pytest.mark.parametrize("columns, words", [
     (lambda xy: xy[:, ::-1], "rays of 0 meet.* with u and v exchanged those of 9 meet"),
-    (lambda xy: xy * [1, -1] + [0, 1499], "rays of 0 .* with v counted from the other edge .* of 9"),
+    (lambda xy: xy * [1, -1] + [0, 1499], "rays of 0 .* with v counted from the other edge .* 9"),
     (lambda xy: xy / 2, "rays of 0 meet.* u and v are pixels of the photographs as they are"),
 ])  # fmt: skip
 def test_image_points_in_wrong_columns_are_named(drone, columns, words):
